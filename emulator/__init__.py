@@ -1,0 +1,1 @@
+"""What happens: the arm, its drives, the cell's I/O and the motion host, on an emulated bus."""

@@ -1,0 +1,1 @@
+"""What it means: recording -> dataset -> regressor -> base parameters -> estimate -> report."""
