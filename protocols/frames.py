@@ -36,9 +36,7 @@ class Frame(msgspec.Struct, frozen=True, gc=False):
 
 def encode(frames: Iterable[Frame]) -> bytes:
     """Virtualcan bytes of `frames`, ready for one `send`."""
-    return b"".join(
-        [_WIRE.pack(_WIRE_BODY, f.can_id, 0, f.dlc or len(f.data), f.data) for f in frames]
-    )
+    return b"".join([_WIRE.pack(_WIRE_BODY, f.can_id, 0, f.dlc or len(f.data), f.data) for f in frames])
 
 
 def decode(buffer: bytes | bytearray | memoryview) -> Iterator[Frame]:
@@ -59,7 +57,7 @@ def decode(buffer: bytes | bytearray | memoryview) -> Iterator[Frame]:
             yield Frame(can_id, data[:dlc])
 
 
-# --- length on the wire -------------------------------------------------------------------------------------------
+# --- length on the wire ---
 
 _CRC15 = 0x4599
 _TAIL_BITS = 1 + 1 + 1 + 7 + 3  # CRC delimiter, ACK slot, ACK delimiter, EOF, interframe space: never stuffed
