@@ -1,0 +1,5 @@
+"""The `armrig` command: the one place that knows all four parts."""
+
+
+def main() -> None:
+    """Entry point."""
