@@ -49,8 +49,8 @@ class Pdo(config.Table, kw_only=True):
         target: RPDO2, active from the next SYNC.
     """
 
-    feedback: list[str] = ["6064:0/32", "6078:0/16", "2001:0/16"]
-    target: list[str] = ["6071:0/16", "607A:0/32"]
+    feedback: tuple[str, ...] = ("6064:0/32", "6078:0/16", "2001:0/16")
+    target: tuple[str, ...] = ("6071:0/16", "607A:0/32")
 
 
 class Cell(config.Table, kw_only=True):
@@ -88,8 +88,8 @@ class Emulated(config.Table, kw_only=True):
 
     machine: str | None = None
     seed: int = 1
-    current_noise_A: list[float] = [0.0]
-    encoder_noise_rad: list[float] = [0.0]
+    current_noise_A: tuple[float, ...] = (0.0,)
+    encoder_noise_rad: tuple[float, ...] = (0.0,)
     effect: list[EffectEntry] = []
 
 
