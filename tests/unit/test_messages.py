@@ -8,7 +8,6 @@ import pytest
 from protocols import messages as m
 from protocols.errors import ConfigError, DataError, IdentificationError, PeerError
 
-
 LOG = b'"runs":[{"source":"log","log":"a"}]'
 
 
