@@ -9,7 +9,7 @@ import numpy as np
 
 from emulator.kernels import Floats, compiled
 
-AT_REST = 1e-12  # rad/s, largest change of a speed in the last sweep
+AT_REST = 1e-10  # rad/s, largest change of a speed in the last sweep; an encoder count at that speed takes hours
 SWEEPS = 500  # reached only where many rows stick at once and the mass matrix couples them strongly
 
 
@@ -60,28 +60,29 @@ def rub(L: Floats, B: Floats, bound: Floats, v: Floats, impulse: Floats, X: Floa
         Sweeps needed.
     """
     K, J = B.shape
+    mobility = np.empty(K)
     for k in range(K):
         impulse[k] = min(max(impulse[k], -bound[k]), bound[k])
         if bound[k] > 0.0:
             X[k, :] = B[k]
             solve(L, X[k])
+            mobility[k] = 0.0
             for j in range(J):
                 v[j] += X[k, j] * impulse[k]
+                mobility[k] += X[k, j] * B[k, j]
     for sweep in range(SWEEPS):
         worst = 0.0
         for k in range(K):
             if bound[k] == 0.0:
                 continue
             speed = 0.0
-            mobility = 0.0
             for j in range(J):
                 speed += B[k, j] * v[j]
-                mobility += B[k, j] * X[k, j]
-            value = min(max(impulse[k] - speed / mobility, -bound[k]), bound[k])
+            value = min(max(impulse[k] - speed / mobility[k], -bound[k]), bound[k])
             change = value - impulse[k]
             if change != 0.0:
                 impulse[k] = value
-                worst = max(worst, abs(change) * mobility)
+                worst = max(worst, abs(change) * mobility[k])
                 for j in range(J):
                     v[j] += X[k, j] * change
         if worst < AT_REST:
