@@ -13,7 +13,7 @@ from scipy import linalg
 
 from ident.base import Base
 from ident.covariance import hac
-from ident.observation import Observation
+from ident.observation import Observation, relative_error
 from protocols.errors import IdentificationError
 
 Array = NDArray[np.float64]
@@ -114,7 +114,7 @@ def estimate(observations: Sequence[Observation], base: Base, method: str = "wls
     covariance, lags = hac(observations, beta, sigma_used, inverse)
     residuals = [o.y - o.predict(beta) for o in observations]
     lag1 = np.array([_lag1(observations, residuals, j) for j in range(joints)])
-    per_joint, error = _errors(observations, residuals)
+    error, per_joint = relative_error(observations, beta)
     rms = np.array([_rms(observations, residuals, j) for j in range(joints)])
     return Estimate(
         method=METHODS[method],
@@ -185,16 +185,6 @@ def _refuse_deficient(A: Array, base: Base, observations: Sequence[Observation])
             f" {names}. {still + ' ' if still else ''}Record a motion in which every joint moves, fast and slow, in"
             " several poses."
         )
-
-
-def _errors(observations: Sequence[Observation], residuals: Sequence[Array]) -> tuple[Array, float]:
-    def norm(parts: Sequence[Array]) -> Array:
-        squares = [(np.where(o.used, p, 0.0) ** 2).sum(axis=1) for o, p in zip(observations, parts, strict=True)]
-        return np.asarray(np.sqrt(np.sum(squares, axis=0)))
-
-    rho, torque = norm(residuals), norm([o.y for o in observations])
-    per_joint = np.divide(rho, torque, out=np.full(len(rho), np.nan), where=torque > 0)
-    return 100 * per_joint, 100 * float(np.linalg.norm(rho) / np.linalg.norm(torque))
 
 
 def _rms(observations: Sequence[Observation], residuals: Sequence[Array], joint: int) -> float:

@@ -1,5 +1,6 @@
 """Dataset and model to the linear system Y = W beta + rho (Janot, Vandanjon & Gautier 2014, eq. (4))."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,12 +59,15 @@ class Observation:
         """W beta, shape (J, N) [N·m]."""
         return np.asarray(self.W @ beta)
 
-    def relative_error(self, beta: Array) -> tuple[float, Array]:
-        """||Y - W beta|| / ||Y|| in percent, over all rows used and per joint, shape (J,); NaN for a joint without."""
-        residual = np.linalg.norm(np.where(self.used, self.y - self.predict(beta), 0.0), axis=1)
-        torque = np.linalg.norm(np.where(self.used, self.y, 0.0), axis=1)
-        per_joint = np.divide(residual, torque, out=np.full(len(torque), np.nan), where=torque > 0)
-        return 100 * float(np.linalg.norm(residual) / np.linalg.norm(torque)), 100 * per_joint
+
+def relative_error(observations: Sequence[Observation], beta: Array) -> tuple[float, Array]:
+    """||Y - W beta|| / ||Y|| in percent over all rows used, and per joint, shape (J,); NaN for a joint without."""
+    rho, torque = (
+        np.sqrt(sum((np.where(o.used, v, 0.0) ** 2).sum(axis=1) for o, v in zip(observations, values, strict=True)))
+        for values in ([o.y - o.predict(beta) for o in observations], [o.y for o in observations])
+    )
+    per_joint = np.divide(rho, torque, out=np.full(len(torque), np.nan), where=torque > 0)
+    return 100 * float(np.linalg.norm(rho) / np.linalg.norm(torque)), 100 * per_joint
 
 
 def observe(

@@ -106,6 +106,8 @@ class IdentifyRequest(Message, frozen=True):
         runs, validation: Recordings to fit and recordings to judge by.
         robot_toml: Robot file that replaces the one attached to the recordings.
         html, model: Also return the report and the identified robot file.
+        truth: Base parameters that the requester knows, of an emulated machine: shown beside the estimates, never
+            used to make them.
     """
 
     id: Name
@@ -116,6 +118,7 @@ class IdentifyRequest(Message, frozen=True):
     options: Options = msgspec.field(default_factory=Options)
     html: bool = True
     model: bool = False
+    truth: dict[str, float] = {}
 
 
 class Accepted(Message, frozen=True, tag="accepted", tag_field="reply"):
