@@ -41,6 +41,22 @@ class Fit(msgspec.Struct, frozen=True):
     noise_floor_percent: float | None = None
 
 
+class Run(msgspec.Struct, frozen=True):
+    """One recording that was used.
+
+    Attributes:
+        role: `fit` or `validation`.
+        verdict: Of the recorder: `LOSSLESS`, `GAPS(n)` or `UNVERIFIABLE`.
+    """
+
+    name: str
+    role: str
+    verdict: str
+    seconds: float
+    samples: int
+    sha256: str
+
+
 class Statistic(msgspec.Struct, frozen=True, omit_defaults=True):
     """One test; `not_applicable` gives the reason where there is no number."""
 
@@ -86,6 +102,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     seconds: float
     covariance: str
     relations: list[str]
+    recordings: list[Run]
     notes: list[str]
 
 

@@ -35,6 +35,8 @@ class Signals:
         tau_Nm: Torque from current, shape (T, J) [N·m]. Row k is the torque at t_s[k] - delay.
         delay_s: Age of the torque, shape (J,) [s]: a mean over the last cycle is half a cycle old.
         notes: What the reader of the recording should know (saturation, ...).
+        verdict: `LOSSLESS`, `GAPS(n)` or `UNVERIFIABLE`, as the recorder closed the file.
+        sha256: Of the file; empty where there is none.
     """
 
     source: str
@@ -44,6 +46,8 @@ class Signals:
     tau_Nm: Array
     delay_s: Array
     notes: list[str] = field(default_factory=list)
+    verdict: str = "UNVERIFIABLE"
+    sha256: str = ""
 
     def __post_init__(self) -> None:
         shape = (self.t_s.size, len(self.joints))

@@ -93,6 +93,7 @@ def identify(
         progress(0.1 + 0.6 * index / len(every), f"dataset and regressor of {signals.source}")
         observations.append(_observe(prepare(signals, settings.filter_Hz), model, base, settings))
     seen, unseen = observations[: len(runs)], observations[len(runs) :]
+    recordings = [_run(s, "fit") for s in runs] + [_run(s, "validation") for s in validation]
     prepared_ns = clock.now_ns() - started
     out = []
     for index, method in enumerate(methods):
@@ -101,7 +102,7 @@ def identify(
         fitted = estimate(seen, base, method)
         reduction = reduce(fitted)
         seconds = (prepared_ns + clock.now_ns() - begun) * 1e-9
-        result = _result(fitted, reduction, model, seen, unseen, truth or {}, seconds)
+        result = _result(fitted, reduction, model, seen, unseen, truth or {}, seconds, recordings)
         out.append(Identification(result, model, base, fitted, reduction, seen, unseen, truth or {}))
     progress(1.0, "done")
     return out
@@ -132,6 +133,11 @@ def _observe(dataset: Dataset, model: Model, base: Base, settings: Settings) -> 
     return observe(dataset, model, base, settings.decimate_to_Hz, settings.speed_threshold_rad_s)
 
 
+def _run(signals: Signals, role: str) -> contract.Run:
+    seconds = float(signals.t_s[-1] - signals.t_s[0])
+    return contract.Run(signals.source, role, signals.verdict, seconds, signals.t_s.size, signals.sha256)
+
+
 def _result(
     fitted: Estimate,
     reduction: Reduction,
@@ -140,6 +146,7 @@ def _result(
     unseen: Sequence[Observation],
     truth: Mapping[str, float],
     seconds: float,
+    recordings: list[contract.Run],
 ) -> contract.Result:
     base = fitted.base
     prior = base.B @ model.theta(model.robot)
@@ -180,6 +187,7 @@ def _result(
         seconds=seconds,
         covariance=fitted.covariance_name,
         relations=base.relations(),
+        recordings=recordings,
         notes=list(dict.fromkeys(notes)),
     )
 

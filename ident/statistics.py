@@ -21,7 +21,7 @@ INDEPENDENT_R2 = 0.1  # paper, IV.B.2
 
 def statistics(estimate: Estimate, observations: Sequence[Observation], reduction: Reduction) -> list[Statistic]:
     """Kolmogorov-Smirnov, Lilliefors, residual regression, Ljung-Box and F."""
-    stretches = normalised_residuals(estimate, observations)
+    stretches = [run for joint in normalised_residuals(estimate, observations) for run in joint]
     values = np.concatenate(stretches) if stretches else np.empty(0)
     return [
         _kolmogorov(values),
@@ -32,15 +32,15 @@ def statistics(estimate: Estimate, observations: Sequence[Observation], reductio
     ]
 
 
-def normalised_residuals(estimate: Estimate, observations: Sequence[Observation]) -> list[Array]:
-    """rho_j / sigma_j (eq. (7)) of each joint's unbroken runs of used rows, one array per run."""
-    out = []
+def normalised_residuals(estimate: Estimate, observations: Sequence[Observation]) -> list[list[Array]]:
+    """rho_j / sigma_j (eq. (7)) of every joint: its unbroken runs of used rows."""
+    out: list[list[Array]] = [[] for _ in estimate.sigma_Nm]
     for o in observations:
         residual = (o.y - o.predict(estimate.beta)) / estimate.sigma_Nm[:, None]
-        for j in range(len(o.joints)):
+        for j, joint in enumerate(out):
             rows = np.flatnonzero(o.used[j])
             breaks = np.flatnonzero((np.diff(rows) > 1) | o.first[rows[1:]]) + 1
-            out += [residual[j, run] for run in np.split(rows, breaks) if run.size]
+            joint += [residual[j, run] for run in np.split(rows, breaks) if run.size]
     return out
 
 
