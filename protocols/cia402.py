@@ -151,7 +151,7 @@ class Status(IntFlag):
     FOLLOWING_ERROR = 0x2000
 
 
-def decode_statusword(statusword: int) -> State | None:
+def state_of(statusword: int) -> State | None:
     """State that a statusword reports; None for a pattern the profile does not know."""
     return next((s for s in State if statusword & s.mask == s.pattern), None)
 
@@ -160,14 +160,14 @@ def decode_statusword(statusword: int) -> State | None:
 
 
 class Mode(IntEnum):
-    """Modes of operation, objects 0x6060 and 0x6061, that armrig's drives have."""
+    """Modes of operation, objects 0x6060 and 0x6061, that armrig's drives have: cyclic synchronous position, torque."""
 
     NONE = 0
-    CYCLIC_POSITION = 8
-    CYCLIC_TORQUE = 10
+    CSP = 8
+    CST = 10
 
 
-SUPPORTED = (Mode.CYCLIC_POSITION, Mode.CYCLIC_TORQUE)
+SUPPORTED = (Mode.CSP, Mode.CST)
 
 
 def supported_modes(modes: Iterable[Mode]) -> int:

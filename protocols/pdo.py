@@ -83,6 +83,11 @@ class Layout:
         else:
             self.pack = lambda values: codec.pack(*(values[k] for k in keys))
 
+    @property
+    def mapped(self) -> tuple[Mapped, ...]:
+        """The objects as `configuration` wants them."""
+        return tuple(Mapped(e.index, e.sub, e.bits) for e in self.entries)
+
 
 def compile_mapping(words: Iterable[int], dictionary: Dictionary, *, transmit: bool) -> Layout:
     """Layout of mapping words, as a device checks them.
