@@ -18,6 +18,7 @@ from protocols.rig import Rig
 from protocols.robot import Robot
 
 SILENT_PERIODS = 20  # without SYNC for so long, the arm follows the clock: a host at rest must not freeze it
+NO_COUNTER = -1
 PATIENCE_PERIODS = 2  # how long one bus waits for the SYNC of another before going on alone
 
 
@@ -29,6 +30,11 @@ class _Segment:
         self.waiting: deque[Frame] = deque()
         self.latched = False  # has seen the SYNC of the present instant
         self.active = False  # carries SYNC
+
+    def counter(self) -> int:
+        """Counter of the SYNC that waits."""
+        data = self.waiting[0].data
+        return data[0] if data else NO_COUNTER
 
 
 class EmulatedRig:
@@ -65,7 +71,7 @@ class EmulatedRig:
         self._mode = np.zeros(joints, dtype=np.int64)
         self._position = np.zeros(joints)
         self._current = np.zeros(joints)
-        self._counter = -1  # of the present instant
+        self._counter = NO_COUNTER  # of the present instant
         self._instant_ns = 0  # when the present instant began
         self._plant_ns = 0  # up to where the arm has been simulated without SYNC
         self.cycles = 0
@@ -89,14 +95,14 @@ class EmulatedRig:
         out: list[list[Frame]] = [[] for _ in self._segments]
         for segment, frames in zip(self._segments, received, strict=True):
             segment.waiting.extend(frames)
+        pairs = list(zip(self._segments, out, strict=True))
         progress = True
         while progress:
-            progress = False
-            for segment, sent in zip(self._segments, out, strict=True):
+            for segment, sent in pairs:
                 self._dispatch(t_ns, segment, sent)
-                progress |= self._sync(t_ns, segment, sent)
+            progress = any([self._sync(t_ns, segment, sent) for segment, sent in pairs])
         self._free_run(t_ns)
-        for segment, sent in zip(self._segments, out, strict=True):
+        for segment, sent in pairs:
             for _, drive in segment.drives:
                 sent.extend(drive.tick(t_ns))
         return out
@@ -113,17 +119,15 @@ class EmulatedRig:
         """Handle the SYNC at the head of a bus, if its instant has come."""
         if not segment.waiting:
             return False
-        data = segment.waiting[0].data
-        counter = data[0] if data else -1
-        same = not segment.latched and (
-            counter == self._counter if data else t_ns - self._instant_ns < self.period_ns // 2
-        )
+        counter = segment.counter()
+        fresh = t_ns - self._instant_ns < self.period_ns // 2  # all that is known of a SYNC without a counter
+        same = not segment.latched and (counter == self._counter if counter != NO_COUNTER else fresh)
         if not same and not self._next_instant(t_ns, counter):
             return False
         segment.waiting.popleft()
         segment.latched = segment.active = True
         for j, drive in segment.drives:
-            sent.extend(drive.on_sync(t_ns, counter if data else None, self._measured[j]))
+            sent.extend(drive.on_sync(t_ns, None if counter == NO_COUNTER else counter, self._measured[j]))
             command = drive.command()
             self._mode[j], self._position[j], self._current[j] = command
             gains = drive.changed_gains()
@@ -133,7 +137,9 @@ class EmulatedRig:
 
     def _next_instant(self, t_ns: int, counter: int) -> bool:
         """Advance the arm by one period unless another bus still owes the present instant's SYNC."""
-        owing = [s for s in self._segments if s.active and not s.latched and not s.waiting]
+        owing = [
+            s for s in self._segments if s.active and not s.latched and (not s.waiting or s.counter() == self._counter)
+        ]
         if owing and t_ns - self._instant_ns < PATIENCE_PERIODS * self.period_ns:
             return False
         for segment in owing:
