@@ -14,7 +14,7 @@ denied): a missing `Done` is therefore the one sign of failure that needs no gue
 
 import hashlib
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import msgspec
 from msgspec import Meta
@@ -37,6 +37,9 @@ Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
 Count = Annotated[int, Meta(ge=0)]
 
 Method = Literal["ols", "wls"]
+METHODS: tuple[Method, ...] = get_args(Method)
+Part = Literal["result", "html", "model"]
+Status = Literal["ok", "failed"]
 ErrorCode = Literal[
     "bad-request", "too-large", "busy", "not-found", "peer", "configuration", "data", "not-identifiable", "bug"
 ]
@@ -144,7 +147,7 @@ class Chunk(Message, frozen=True, tag="chunk", tag_field="reply"):
     """
 
     index: Count
-    part: Literal["result", "html", "model"]
+    part: Part
     bytes: Count
 
 
@@ -162,7 +165,7 @@ class Done(Message, frozen=True, tag="done", tag_field="reply"):
         count, bytes, sha256: Of all chunks, their bytes one after the other.
     """
 
-    status: Literal["ok", "failed"]
+    status: Status
     count: Count
     bytes: Count
     sha256: Sha256
@@ -237,7 +240,7 @@ def encode(message: Message, body: bytes = b"") -> bytes:
     return msgspec.json.encode(message) + b"\n" + body if body else msgspec.json.encode(message)
 
 
-def decode(payload: bytes, kind: type[T] | Any) -> tuple[T, bytes]:
+def decode(payload: bytes, kind: type[T]) -> tuple[T, bytes]:
     """Message and raw bytes of a payload.
 
     Raises:
@@ -252,6 +255,12 @@ def decode(payload: bytes, kind: type[T] | Any) -> tuple[T, bytes]:
         return msgspec.json.decode(header, type=kind), body
     except msgspec.DecodeError as error:  # ValidationError, which carries the path, is one
         raise ConfigError(f"The message is not valid: {error}.") from error
+
+
+def decode_reply(payload: bytes) -> tuple[Reply, bytes]:
+    """`decode` for any reply of the identification service."""
+    reply: tuple[Reply, bytes] = decode(payload, Reply)  # type: ignore[arg-type]  # a union is no type[T] to mypy
+    return reply
 
 
 def split(recordings: list[Attached], body: bytes) -> list[bytes]:
@@ -275,6 +284,11 @@ def split(recordings: list[Attached], body: bytes) -> list[bytes]:
 
 def sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
+
+
+def done(status: Status, count: int, data: bytes) -> Done:
+    """Last reply after `count` chunks with `data` in them."""
+    return Done(status=status, count=count, bytes=len(data), sha256=sha256(data))
 
 
 # --- failures across the wire ---
