@@ -1,5 +1,7 @@
-"""Writes emulator/machines/tx40-machine.toml: a physical arm whose 28 essential base parameters are those that
-Janot et al. 2014 identified (Table 3; two of them moved, see BUILDABLE) and whose other base parameters are as near zero as physics permits.
+"""Writes emulator/machines/tx40-machine.toml: a physical arm with the base parameters of Janot et al. 2014.
+
+Its 28 essential base parameters are those of Table 3 (two of them moved, see BUILDABLE), its other base parameters
+are as near zero as physics permits.
 
     python tests/studies/tx40_machine.py
 
@@ -7,12 +9,13 @@ A semidefinite program over the masses, first moments and inertias of the six li
 of the nominal link's, so every link could be built), rotor inertias and their regrouping; frictions are the table's.
 """
 
-import re
 from pathlib import Path
+from typing import Any
 
 import cvxpy as cp
 import msgspec
 import numpy as np
+from layout import one_line_arrays
 from numpy.typing import NDArray
 
 from emulator.kernels import rnea
@@ -117,13 +120,13 @@ def standard(robot: Robot) -> Floats:
     return np.concatenate([links, [joint.parameters.rotor_inertia_kgm2 for joint in robot.joint]])
 
 
-def pseudo_inertia(link: list[object]) -> list[list[object]]:
+def pseudo_inertia(link: list[Any]) -> list[list[Any]]:
     """Wensing et al. 2018: positive definite if and only if some mass distribution has these ten parameters."""
     m, mx, my, mz, xx, xy, xz, yy, yz, zz = link
     return [
-        [(yy + zz - xx) / 2, -xy, -xz, mx],  # type: ignore[operator]
-        [-xy, (xx + zz - yy) / 2, -yz, my],  # type: ignore[operator]
-        [-xz, -yz, (xx + yy - zz) / 2, mz],  # type: ignore[operator]
+        [(yy + zz - xx) / 2, -xy, -xz, mx],
+        [-xy, (xx + zz - yy) / 2, -yz, my],
+        [-xz, -yz, (xx + yy - zz) / 2, mz],
         [mx, my, mz, m],
     ]
 
@@ -156,7 +159,8 @@ def solve(nominal: Robot) -> Floats:
     solution = np.array(x.value)
     # The solver meets the table to about 1e-9; the nearest point meets it to rounding.
     rows = K[[base_names().index(name) for name in wanted]]
-    return solution + np.linalg.pinv(rows) @ (np.array(list(wanted.values())) - rows @ solution)
+    exact: Floats = solution + np.linalg.pinv(rows) @ (np.array(list(wanted.values())) - rows @ solution)
+    return np.round(exact, 12) + 0.0
 
 
 def machine(nominal: Robot, x: Floats) -> Robot:
@@ -166,13 +170,13 @@ def machine(nominal: Robot, x: Floats) -> Robot:
     """
     joints = []
     for j, joint in enumerate(nominal.joint):
-        m, mx, my, mz, *inertia = (float(value) for value in x[10 * j : 10 * j + 10])
+        m, mx, my, mz, xx, xy, xz, yy, yz, zz = (float(value) for value in x[10 * j : 10 * j + 10])
         shared = MOTOR6_VISCOUS if j >= 4 else 0.0
         last = j == 5
         parameters = Parameters(
             mass_kg=m,
             first_moment_kgm=(mx, my, mz),
-            inertia_kgm2=tuple(inertia),
+            inertia_kgm2=(xx, xy, xz, yy, yz, zz),
             rotor_inertia_kgm2=float(x[60 + j]),
             viscous_Nms_rad=round(VISCOUS_TABLE[j] - shared, 12),
             coulomb_Nm=COULOMB_TABLE[j],
@@ -191,10 +195,6 @@ HEADER = """\
 """
 
 
-def _one_line(numbers: re.Match[str]) -> str:
-    return "[" + ", ".join(numbers[0].strip("[]").replace(",", " ").split()) + "]"
-
-
 def main() -> None:
     nominal = load("tx40")
     K, torque = regrouping(nominal)
@@ -206,7 +206,7 @@ def main() -> None:
     for j in range(6):
         P = np.array(pseudo_inertia(list(x[10 * j : 10 * j + 10])), dtype=float)
         print(f"link {j + 1}: mass {x[10 * j]:.3f} kg, eigenvalues of the pseudo-inertia {np.linalg.eigvalsh(P)}")
-    text = re.sub(r"\[[^\[\]a-z]*\]", _one_line, config.to_toml(machine(nominal, x)))
+    text = one_line_arrays(config.to_toml(machine(nominal, x)))
     TARGET.write_text(HEADER + text, encoding="utf-8")
     print(f"wrote {TARGET.name}")
 
