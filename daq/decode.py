@@ -12,7 +12,6 @@ from protocols.rig import DriveNode, Rig
 from protocols.robot import Robot
 from protocols.topics import ERROR_LEVEL, INFO, WARNING, Event
 
-
 # Classes of SocketCAN error frames, linux/can/error.h
 _ERROR_CLASSES = {
     0x001: "transmission timed out",

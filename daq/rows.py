@@ -11,6 +11,7 @@ from protocols import topics
 from protocols.cdr import Block
 from protocols.frames import ERROR, EXTENDED, ID_MASK, MAX_DATA, REMOTE, Frame
 from protocols.robot import Robot
+from protocols.signals import joint_side
 from protocols.topics import CellSample, Event
 
 _SECOND = np.uint64(1_000_000_000)
@@ -77,22 +78,6 @@ class CycleRows:
         _stamp(states, grid)
         states["position"], states["effort"] = joint_side(self._robot, position, current, missing)
         return arrival.astype(np.uint64), grid, raw, states
-
-
-def joint_side(
-    robot: Robot, position: NDArray[np.int64], permille: NDArray[np.int64], missing: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Joint positions [rad] and, from the nominal drive gains, joint torques [N·m], shapes (T, J).
-
-    NaN where a drive that the value depends on was not received: with coupled axes one drive speaks for two joints.
-    """
-    rated_A = np.array([j.drive.rated_current_A for j in robot.joint])
-    coupling = robot.coupling_matrix()
-    q = robot.joint_position(position)
-    tau = robot.joint_torque(permille * (rated_A / 1000))
-    q[missing @ (np.linalg.inv(coupling).T != 0)] = np.nan
-    tau[missing @ (coupling != 0)] = np.nan
-    return q, tau
 
 
 def cell_values(sample: CellSample) -> Mapping[str, Any]:
