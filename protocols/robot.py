@@ -106,7 +106,13 @@ class Parameters(config.Table, kw_only=True):
 
 
 class Joint(config.Table, kw_only=True):
-    """One axis: where it is, what it may do, what drives it."""
+    """One axis: where it is, what it may do, what drives it.
+
+    Attributes:
+        placement: Frame j in frame j-1 at q = 0 in place of the MDH row: three rows of the rotation, then the origin
+            [m]. Written when a URDF file is loaded.
+        sigma: 1-sigma of the a-priori parameters.
+    """
 
     name: str
     kind: Literal["revolute", "prismatic"] = "revolute"
@@ -114,6 +120,7 @@ class Joint(config.Table, kw_only=True):
     d_m: float = 0.0
     theta0_rad: float = 0.0
     r_m: float = 0.0
+    placement: tuple[Vector3, Vector3, Vector3, Vector3] | None = None
     position_min_rad: float
     position_max_rad: float
     velocity_max_rad_s: Positive
@@ -154,7 +161,8 @@ class Robot(config.Table, kw_only=True):
         name: Shown everywhere.
         joint: Axes from the base to the tool.
         gravity_m_s2: In the base frame.
-        urdf: Path of a URDF file that replaces the joints' MDH geometry and inertial parameters.
+        urdf: Path of a URDF file, relative to the robot file: its geometry replaces the joints' MDH rows, and its
+            inertial parameters those of links without a mass. `load` writes them into the joints.
         coupling: Rows of C with motor speed (joint side) = C dq; identity where left out.
         effect: Physics found by `explain`, loaded by the emulator.
     """
@@ -253,6 +261,9 @@ def geometry(robot: Robot) -> Geometry:
     zero = np.zeros_like(ca)
     R0 = np.array([[ct, -st, zero], [ca * st, ca * ct, -sa], [sa * st, sa * ct, ca]]).transpose(2, 0, 1)
     p0 = np.array([d, -sa * r, ca * r]).T
+    for j, joint in enumerate(robot.joint):
+        if joint.placement is not None:
+            R0[j], p0[j] = joint.placement[:3], joint.placement[3]
     prismatic = np.array([int(j.kind == "prismatic") for j in robot.joint])
     return Geometry(np.ascontiguousarray(R0), np.ascontiguousarray(p0), prismatic, np.array(robot.gravity_m_s2))
 
@@ -261,6 +272,12 @@ def load(name: str, base: Path | None = None) -> Robot:
     """Robot of a file path or of a shipped robot's name.
 
     Raises:
-        ConfigError: As `config.locate` and `config.read`.
+        ConfigError: As `config.locate` and `config.read`; its URDF file is missing or does not fit.
     """
-    return config.read(config.locate(name, ".toml", base), Robot)
+    path = config.locate(name, ".toml", base)
+    robot = config.read(path, Robot)
+    if robot.urdf is None:
+        return robot
+    from protocols.urdf import resolved  # needs pinocchio, which most robots do not
+
+    return resolved(config.locate(robot.urdf, ".urdf", path.parent), robot)
