@@ -112,6 +112,7 @@ def _currents(
     target: Floats,
     target_A: Floats,
     draw: Floats,
+    middle: Floats,
     speed: Floats,
     share: float,
     mean: Floats,
@@ -119,7 +120,7 @@ def _currents(
     """One substep of all current loops: fills mean, shape (J,) [A].
 
     Args:
-        speed: Joint speeds in the middle of the substep.
+        middle, speed: Joint positions and speeds in the middle of the substep.
         share: Of the way from the last position target to this one.
     """
     J = len(mode)
@@ -129,7 +130,7 @@ def _currents(
             continue
         angle, turning = 0.0, 0.0
         for i in range(J):
-            angle += power.C[j, i] * state.q[i]
+            angle += power.C[j, i] * middle[i]
             turning += power.C[j, i] * speed[i]
         reference = target_A[j]
         if mode[j] == CSP:
@@ -211,7 +212,7 @@ def advance_period(
         place(body.R0, body.p0, body.prismatic, middle, R, p)
         newton_euler(R, p, body.prismatic, body.gravity, body.link, speed, rest, torque, f, n)
         composite_inertia(R, p, body.prismatic, body.link, M, whole)
-        _currents(power, state, mode, target, target_A, draws[step], speed, (step + 1) / substeps, mean)
+        _currents(power, state, mode, target, target_A, draws[step], middle, speed, (step + 0.5) / substeps, mean)
 
         for j in range(J):
             kick[j] = -torque[j] - body.offset_Nm[j]
