@@ -3,8 +3,6 @@
 What has been flushed survives the end of this process, what has been synced survives the end of power.
 """
 
-import fcntl
-import os
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from daq.disk import Disk
 from daq.mcapfile import McapFile
 from daq.rows import Rows, Times
 from protocols import topics
@@ -42,7 +41,7 @@ class Store:
         self.part = path.with_name(path.name + PART)
         self.failure: str | None = None
         self._channels: dict[str, int] = {}
-        self._disk = _Disk(_create(self.part))
+        self._disk = Disk(self.part)
         try:
             self._mcap = McapFile(self._disk, topics.PROFILE, LIBRARY, chunk_bytes)
             self._mcap.metadata(topics.RUN_START, start.to_metadata())
@@ -92,7 +91,7 @@ class Store:
         self._do(self._mcap.metadata, topics.RUN_STOP, stop)
         self._do(self._mcap.finish)
         self._do(self._disk.sync)
-        self._do(self.part.replace, self.path)
+        self._do(self._disk.publish, self.path)
         self._disk.close()
 
     def _do(self, action: Callable[..., object], *arguments: object) -> None:
@@ -104,50 +103,8 @@ class Store:
             self._disk.cut()
             self.failure = (
                 f"{self.path}: recording stopped, the disk refuses: {error.strerror}. {self._disk.sound} bytes are kept"
-                f" in {self.part.name}: make room, then run armrig recover {self.part.name} -o {self.path.name}."
+                f" in {self.part}: make room, then run armrig recover {self.part} -o {self.path}."
             )
 
 
 _SIGNALS = {topic.name: topic.type for topic in topics.TOPICS if topic.name != topics.FRAMES}
-
-
-class _Disk:
-    """Unbuffered output that knows how far the file is whole."""
-
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-        self.sound = 0
-
-    def write(self, data: bytes) -> None:
-        rest = memoryview(data)
-        while rest:
-            rest = rest[os.write(self._descriptor, rest) :]
-        self.sound += len(data)
-
-    def sync(self) -> None:
-        os.fdatasync(self._descriptor)
-
-    def cut(self) -> None:
-        os.ftruncate(self._descriptor, self.sound)
-
-    def close(self) -> None:
-        os.close(self._descriptor)
-
-
-def _create(part: Path) -> int:
-    """Descriptor of a new, locked file."""
-    try:
-        descriptor = os.open(part, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        raise DataError(f"{part}: cannot be created: {error.strerror}.") from error
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(descriptor)
-        raise DataError(f"{part}: another recorder is writing this file. Choose another name with -o.") from error
-    if os.fstat(descriptor).st_size:
-        os.close(descriptor)
-        raise DataError(
-            f"{part}: an unfinished recording is in the way. Run armrig recover {part.name} -o FILE, or delete it."
-        )
-    return descriptor

@@ -19,15 +19,16 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, McapRecord, Metadata, Schema
-from mcap.writer import MCAP0_MAGIC as MAGIC
+from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
+MAGIC = MCAP0_MAGIC
 MAX_CHUNK_BYTES = 64 << 20  # decompressed; ours have 256 KiB, the largest seen elsewhere 4 MiB
 MAX_SIGNAL_BYTES = 4 << 30  # of one topic; ten hours of six drives at 1 kHz
 _HEAD = struct.Struct("<BQ")
 _INDEX_HEAD = struct.Struct("<HI")
 _INDEX_ENTRY_BYTES = 16
-_MESSAGE = struct.Struct("<HIQQ")
+MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the data
 
 Buffer = bytes | memoryview
 R = TypeVar("R", bound=McapRecord)
@@ -269,15 +270,15 @@ def _gather(contents: Contents, data: Buffer, spans: list[Span], found: dict[str
     """Sort messages to their topics; returns the bytes kept."""
     starts: dict[int, list[tuple[int, int]]] = {}
     for span in spans:
-        if span.end - span.start < _MESSAGE.size:
+        if span.end - span.start < MESSAGE.size:
             raise BrokenFileError(span.begin, "has a message shorter than its head")
-        channel, _sequence, log_time, _publish_time = _MESSAGE.unpack_from(data, span.start)
+        channel, _sequence, log_time, _publish_time = MESSAGE.unpack_from(data, span.start)
         if channel not in contents.channels:
             raise BrokenFileError(span.begin, f"has a message of the unknown channel {channel}")
         topic = found.get(contents.channels[channel].topic)
         if topic is not None:
             topic.log_time.append(log_time)
-            starts.setdefault(channel, []).append((span.start + _MESSAGE.size, span.end))
+            starts.setdefault(channel, []).append((span.start + MESSAGE.size, span.end))
     raw = np.frombuffer(data, dtype=np.uint8)
     kept = 0
     for channel, places in starts.items():
