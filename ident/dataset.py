@@ -19,7 +19,7 @@ FILTER_ORDER = 4  # paper V.B
 GAP = 1.5  # steps of this many periods or more are gaps
 JITTER = 0.02  # share of a period by which a step may differ; SYNC grid time has none
 NYQUIST_SHARE = 0.9  # a cut-off above this share of half the rate filters nothing
-SETTLE = 3.0  # periods of the cut-off that the filter's ends disturb
+SETTLE = 5.0  # periods of the cut-off after which the ends of the filter disturb accelerations by less than 1e-4
 STENCIL = 2  # samples either side of the five-point differences
 
 

@@ -16,11 +16,11 @@ Array = NDArray[np.float64]
 
 DECIMATE_TO_HZ = 50.0  # paper V.B: 5 kHz / 100
 CHEBYSHEV_ORDER, CHEBYSHEV_RIPPLE_DB, CHEBYSHEV_CUT = 8, 0.05, 0.8  # MATLAB's decimate
-EDGE = 4  # decimated samples at each end that the filter's ends disturb
+EDGE = 4  # decimated samples left out at each end, where the filter has seen one side only
 SLOW = 0.02  # share of a joint's peak speed below which the sign of its friction is uncertain
 STILL = 1e-3  # range of positions below which a joint did not move [rad or m]
 BLOCK = 16384  # full-rate samples whose columns are in memory at a time
-PADDING = 40  # decimated samples either side of a block: the filtered block equals the whole to rounding
+PADDING = 80  # decimated samples either side of a block: the filter forgets by a factor 10 in 10 of them
 
 
 @dataclass(frozen=True)
