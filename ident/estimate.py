@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 METHODS = {"ols": "IDIM-OLS", "wls": "IDIM-WLS"}
 DEFICIENT = 1e-8  # singular value, columns scaled to 1, below which a motion does not show a combination
+ROUNDING = 1e-13  # of the largest column: smaller ones are zeros of the structure
 SHOWN_SHARE = 0.1  # weight of a parameter in an unseen combination from which on it is named
 
 
@@ -152,7 +153,7 @@ def _joint_sigma(factor: Array, rows: int) -> float:
         return 1.0  # no rows to weight
     A, y = factor[:, :-1], factor[:, -1]
     norms = np.linalg.norm(A, axis=0)
-    active = norms > 0
+    active = norms > ROUNDING * norms.max(initial=0.0)
     solution, _, rank, _ = np.linalg.lstsq(A[:, active] / norms[active], y, rcond=DEFICIENT)
     residual = np.linalg.norm(y - (A[:, active] / norms[active]) @ solution)
     return max(float(residual / np.sqrt(max(1, rows - rank))), float(np.finfo(float).tiny))
