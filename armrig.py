@@ -8,7 +8,8 @@ log to stderr; an error is one sentence and an exit code (0 done, 1 bug, 2 usage
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+import uuid
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,6 +21,7 @@ from protocols.errors import ArmrigError, ConfigError
 
 if TYPE_CHECKING:
     from emulator.rig import EmulatedRig
+    from protocols.messages import Attached, Logged
     from protocols.motion import Motion
     from protocols.rig import Rig
     from protocols.robot import Robot
@@ -207,8 +209,8 @@ class RealTime:
 
 def emulate_on_buses(rig_name: str, moved: Sequence[str], duration: float | None, seed: int | None) -> None:
     from emulator.bus import open_bus
-    from emulator.cell import CellServer
     from emulator.hubprocess import HubProcess
+    from emulator.priority import real_time
     from emulator.shell import emulate as run
     from protocols.clock import RealClock
 
@@ -221,12 +223,13 @@ def emulate_on_buses(rig_name: str, moved: Sequence[str], duration: float | None
         opened = [msgspec.structs.replace(b, channel=channels.get(b.name, b.channel)) for b in rig.bus]
         buses = [stack.enter_context(open_bus(b)) for b in opened]
         stop = stack.enter_context(stopping())
-        cell = None if rig.cell is None else CellServer(rig.cell)
+        cell = None
         if cell is not None:
             cell.start()
             stack.callback(cell.stop)
         places = ", ".join(f"{b.name} {b.interface}:{b.channel}" for b in opened)
         log(f"{rig.name} is running on {places}" + (f", cell on {rig.cell.host}:{rig.cell.port}" if rig.cell else ""))
+        real_time()
         run(arm, buses, RealClock(), stop, duration, None if cell is None else lambda t_ns: cell.update(arm.cell(t_ns)))
     log(f"{arm.cycles} cycles; {arm.skewed} at which a bus had no SYNC")
 
@@ -241,6 +244,7 @@ def move(
     """Drive the arm: NMT start, enable, stream references at the SYNC rate, stop safely. Ctrl-C brakes and disables."""
     from emulator.bus import open_bus
     from emulator.host import Host
+    from emulator.priority import real_time
     from emulator.shell import move as run
     from protocols.cia402 import Mode
     from protocols.clock import RealClock
@@ -252,4 +256,375 @@ def move(
     with ExitStack() as stack:
         buses = [stack.enter_context(open_bus(b)) for b in cell.bus]
         stop = stack.enter_context(stopping())
+        if not real_time():
+            log("real-time priority is not allowed here; cycles may be late")
         print(run(host, buses, RealClock(), stop, cell.sync_period_us * 1000))
+
+
+@app.command()
+def hub(rig: RigFile) -> None:
+    """Serve the virtualcan buses of a rig by themselves; `armrig emulate` does so by default."""
+    from emulator.hub import serve as serve_hub
+
+    cell, _ = load(rig)
+    served = [(b.name, b.channel) for b in cell.bus if b.interface == "virtualcan"]
+    serve_hub(served, lambda channels: log("hub is running on " + ", ".join(f"{n} {c}" for n, c in channels.items())))
+
+
+# --- recordings ---
+
+
+@app.command()
+def record(
+    rig: RigFile,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN.mcap", help="Recording to write.")],
+    bus: BusOption = None,
+    duration: DurationOption = None,
+    until_quiet: Annotated[
+        float | None, typer.Option(metavar="S", min=0.0, help="Stop when SYNC has been there and then missing so long.")
+    ] = None,
+    offer: Annotated[
+        bool, typer.Option(help="Afterwards offer the recording over Zenoh until Ctrl-C, for `armrig request`.")
+    ] = False,
+    connect: Annotated[str | None, typer.Option(metavar="EP", help="Zenoh endpoint; the rig file's otherwise.")] = None,
+) -> None:
+    """Listen to a rig and record every frame, the decoded cycles and the cell. Never transmits on CAN.
+
+    Ends with Ctrl-C, after --duration, or when the motion is over (--until-quiet); the file is complete either way.
+    """
+    from daq.recorder import Recorder
+    from daq.shell import Quiet, Writer, record_pipe
+    from daq.shell import record as run
+    from protocols.clock import RealClock, utc_now_ns
+    from protocols.dictionary import drive_dictionary
+    from protocols.eds import eds
+
+    cell, robot = load(rig, None if bus == PIPE else bus)
+    names = [b.name for b in cell.bus]
+    sheets = {f"{j.name}.eds": eds(drive_dictionary(j.drive), f"{j.name}.eds") for j in robot.joint}
+    with ExitStack() as stack:
+        stop = stack.enter_context(stopping())
+        clock = RealClock()
+        listeners = [] if bus == PIPE else open_listeners(cell, clock, stack)
+        recorder = Recorder(
+            output, cell, robot, sheets, created_utc_ns=utc_now_ns(), seed=cell.emulated.seed if bus == PIPE else None
+        )
+        writer = Writer(recorder, names)
+        writer.start()
+        log(f"recording {output}")
+        try:
+            if bus == PIPE:
+                record_pipe(writer, sys.stdin.buffer, names, stop.is_set)
+            else:
+                start_poller(cell, clock, writer, stack)
+                run(writer, listeners, clock, stop, duration, Quiet(until_quiet))
+        finally:
+            summary = writer.finish()
+        stop.clear()
+        report_recording(summary)
+        if offer:
+            offer_log(summary.path, connect or cell.zenoh.endpoint, stop)
+
+
+def open_listeners(rig: "Rig", clock: Any, stack: ExitStack) -> list[Any]:
+    from daq.bus import open_listener
+
+    return [stack.enter_context(open_listener(b, clock)) for b in rig.bus]
+
+
+def start_poller(rig: "Rig", clock: Any, writer: Any, stack: ExitStack) -> None:
+    return
+
+    if rig.cell is not None:
+        poller = CellPoller(rig.cell, clock, writer.put)
+        poller.start()
+        stack.callback(poller.stop)
+
+
+def report_recording(summary: Any) -> None:
+    """The closing line of a recording.
+
+    Raises:
+        DataError: The disk refused; what was written before is kept.
+    """
+    from protocols.errors import DataError
+
+    print(
+        f"{summary.path}: {summary.seconds:.1f} s, {summary.frames} frames, {summary.cycles} cycles, {summary.verdict}"
+    )
+    for reason in summary.because:
+        print(f"  {reason}")
+    if summary.failure is not None:
+        raise DataError(f"the recording is not complete: {summary.failure} `armrig recover` keeps what there is.")
+
+
+def offer_log(path: Path, endpoint: str, stop: threading.Event) -> None:
+    from daq.serve import LogServer
+
+    with LogServer(endpoint, [path]) as server:
+        log(f"offered as {', '.join(server.keys)} at {endpoint}; Ctrl-C ends it")
+        stop.wait()
+
+
+@app.command()
+def info(
+    recordings: Recordings,
+    json: JsonOption = None,
+) -> None:
+    """What recordings hold: duration, rates, verdict, robot, versions, events."""
+    from daq.describe import describe, text
+
+    found = [describe(Path(r)) for r in recordings]
+    if json != "-":
+        print("\n\n".join(text(d) for d in found))
+    write_json(found[0] if len(found) == 1 else found, json)
+
+
+@app.command()
+def recover(
+    broken: Annotated[Path, typer.Argument(metavar="BROKEN.mcap", help="Truncated or damaged recording.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN.mcap", help="Readable recording to write.")],
+) -> None:
+    """Save what can be read of a truncated or damaged recording, and say what is missing."""
+    from daq.recover import recover as run
+
+    print(run(broken, output))
+
+
+@app.command()
+def export(
+    recording: Annotated[Path, typer.Argument(metavar="RUN.mcap")],
+    to: Annotated[
+        Path, typer.Option(metavar="FILE", help="run.csv, run.npz, run.parquet, or run.log for candump text.")
+    ],
+) -> None:
+    """Write a recording's signals as a table, units in the column names, or its frames as candump text."""
+    from daq.export import export as run
+
+    print(run(recording, to))
+
+
+# --- identification ---
+
+MethodOption = Annotated[str, typer.Option("--method", metavar="M[,M...]", help="ols, wls.")]
+ValidateOption = Annotated[
+    list[str] | None, typer.Option("--validate", metavar="RUN.mcap", help="Recording to judge by, not to fit.")
+]
+RobotOption = Annotated[
+    str | None, typer.Option("--robot", metavar="ROBOT.toml", help="Replaces the robot file inside the recordings.")
+]
+TruthOption = Annotated[
+    str | None,
+    typer.Option(metavar="ROBOT.toml", help="Known parameters, such as an emulated machine's: shown, never used."),
+]
+HtmlOption = Annotated[str | None, typer.Option("--html", metavar="FILE", help="Report.")]
+ModelOption = Annotated[
+    str | None, typer.Option("--model-out", metavar="ROBOT2.toml", help="Robot file with the identified parameters.")
+]
+
+
+@app.command()
+def identify(
+    recordings: Recordings,
+    robot: RobotOption = None,
+    method: MethodOption = "wls",
+    validate: ValidateOption = None,
+    truth: TruthOption = None,
+    json: JsonOption = None,
+    html: HtmlOption = None,
+    model_out: ModelOption = None,
+) -> None:
+    """Dynamic parameters of recordings, here and now."""
+    from ident.contract import to_json
+    from ident.identify import identify as run
+    from ident.recorded import signals
+    from ident.report import render
+    from ident.service import model_file
+    from protocols.recording import read_recording
+    from protocols.robot import load as load_robot
+
+    given = None if robot is None else load_robot(robot)
+    runs = [read_recording(Path(r), given) for r in recordings]
+    unseen = [read_recording(Path(r), given) for r in validate or []]
+    found = run([signals(r) for r in runs], runs[0].robot, method.split(","), [signals(r) for r in unseen])
+    deliver(
+        json,
+        html,
+        model_out,
+        to_json([i.result for i in found]),
+        render(found).encode() if html else b"",
+        model_file(found[0]).encode() if model_out else b"",
+    )
+
+
+def deliver(
+    json: str | None, html: str | None, model_out: str | None, result: bytes, report: bytes, model: bytes
+) -> None:
+    """An identification to where the user wants it; a table on stdout unless JSON goes there."""
+    from ident.contract import from_json
+    from ident.printout import show
+
+    if json == "-":
+        sys.stdout.write(result.decode())
+    else:
+        show(from_json(result))
+        if json:
+            Path(json).write_bytes(result)
+    for destination, data in ((html, report), (model_out, model)):
+        if destination:
+            Path(destination).write_bytes(data)
+            log(f"written: {destination}")
+
+
+ConnectOption = Annotated[str, typer.Option("--connect", metavar="EP", help="Zenoh endpoint of the service.")]
+ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+@app.command()
+def serve(
+    listen: Annotated[str, typer.Option(metavar="EP", help="Zenoh endpoint to listen on.")] = ENDPOINT,
+) -> None:
+    """Run the identification service until Ctrl-C."""
+    from importlib.metadata import version
+
+    from ident.zenoh_service import serve as run
+
+    with stopping() as stop:
+        run(listen, version("armrig"), stop, lambda: log(f"identification service is running at {listen}"))
+
+
+request_app = typer.Typer(no_args_is_help=True, help="Ask a service.")
+app.add_typer(request_app, name="request")
+
+
+@request_app.command("identify")
+def request_identify(
+    recordings: Annotated[list[str], typer.Argument(metavar="RUN.mcap|LOG-KEY...", help="Files, or logs on offer.")],
+    connect: ConnectOption = ENDPOINT,
+    robot: RobotOption = None,
+    method: MethodOption = "wls",
+    validate: Annotated[list[str] | None, typer.Option("--validate", metavar="RUN.mcap|LOG-KEY")] = None,
+    truth: TruthOption = None,
+    json: JsonOption = None,
+    html: HtmlOption = None,
+    model_out: ModelOption = None,
+) -> None:
+    """Dynamic parameters of recordings, computed by a service."""
+    answer = ask(recordings, validate or [], connect, robot, method, html=bool(html), model=bool(model_out))
+    deliver(json, html, model_out, answer["result"], answer.get("html", b""), answer.get("model", b""))
+
+
+def ask(
+    runs: Sequence[str],
+    validation: Sequence[str],
+    endpoint: str,
+    robot: str | None,
+    method: str,
+    *,
+    html: bool,
+    model: bool,
+    truth: dict[str, float] | None = None,
+) -> dict[str, bytes]:
+    """Parts of a service's answer by name.
+
+    Raises:
+        ArmrigError: As `ident.zenoh_client.request`.
+    """
+    from ident.zenoh_client import request
+    from protocols import config, messages
+    from protocols.robot import load as load_robot
+
+    references, body = refer([*runs, *validation])
+    wanted = messages.IdentifyRequest(
+        id=uuid.uuid4().hex,
+        methods=method.split(","),  # type: ignore[arg-type] - checked by the service, whose methods may be newer
+        runs=references[: len(runs)],
+        validation=references[len(runs) :],
+        robot_toml=None if robot is None else config.to_toml(load_robot(robot)),
+        html=html,
+        model=model,
+        truth=truth or {},
+    )
+    with progress() as told:
+        return request(endpoint, wanted, body, told).parts
+
+
+def refer(names: Sequence[str]) -> "tuple[list[Attached | Logged], bytes]":
+    """Recordings of a request: files by their bytes, everything else as a log key.
+
+    Raises:
+        ConfigError: Neither a file nor a possible key.
+    """
+    from protocols import messages
+
+    references: list[Attached | Logged] = []
+    body = b""
+    for name in names:
+        path = Path(name)
+        if path.is_file():
+            data = path.read_bytes()
+            references.append(messages.Attached(name=path.name, bytes=len(data), sha256=messages.sha256(data)))
+            body += data
+        elif messages.is_log_id(name):
+            references.append(messages.Logged(log=name))
+        else:
+            raise ConfigError(f"{name}: no such file, and no log key either (letters, digits, - and _).")
+    return references, body
+
+
+@contextmanager
+def progress() -> Iterator[Callable[[float, str], None]]:
+    """How far long work is: a bar on a terminal, plain lines elsewhere."""
+    if not sys.stderr.isatty():
+        yield lambda fraction, stage: log(f"{100 * fraction:3.0f} % {stage}")
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=1.0)
+        yield lambda fraction, stage: bar.update(task, completed=fraction, description=stage)
+
+
+# --- the whole chain ---
+
+
+@app.command()
+def demo(
+    robot: Annotated[str, typer.Option(help="tx40 or emps.")] = "tx40",
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Recordings, logs, result and report go here.")] = Path(
+        "armrig-demo"
+    ),
+    clock: Annotated[str, typer.Option(help="real, or sim: as fast as the CPU allows.")] = "real",
+) -> None:
+    """Emulate, drive, record and identify an arm with four processes over CAN and Zenoh; prints the report's path.
+
+    One motion is identified, another is predicted. The true parameters are known to the emulator only; the report
+    sets them beside the identified ones.
+    """
+    from emulator.demo import Demo
+
+    if clock not in {"real", "sim"}:
+        raise ConfigError(f"--clock {clock}: choose real or sim.")
+    begin = RealTime()
+    with stopping() as stop, Demo(robot, out, stop, log) as chain:
+        print(chain.run(clock))
+    print(f"{out / 'report.html'}   ({begin.seconds:.0f} s in all)")
+
+
+@app.command()
+def doctor(json: JsonOption = None) -> None:
+    """What this machine offers: SocketCAN, ports, timer, Zenoh, compiled kernels. Compiles what is missing."""
+    from emulator import doctor as rig_doctor
+    from ident import doctor as service_doctor
+
+    found = []
+    for check in (*rig_doctor.checks(), *service_doctor.checks()):
+        found.append(check)
+        if json != "-":
+            print(f"{'ok  ' if check.ok else 'note'}  {check.name:<20} {check.detail}", flush=True)
+    write_json(found, json)
+
+
+if __name__ == "__main__":
+    main()

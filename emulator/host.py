@@ -89,9 +89,7 @@ class Host:
         mode: 10, cyclic synchronous torque: the PD law runs here; 8, cyclic synchronous position: in the drives.
     """
 
-    def __init__(
-        self, rig: Rig, robot: Robot, plan: motion.Motion, mode: cia402.Mode = cia402.Mode.CST
-    ) -> None:
+    def __init__(self, rig: Rig, robot: Robot, plan: motion.Motion, mode: cia402.Mode = cia402.Mode.CST) -> None:
         bus_names = [b.name for b in rig.bus]
         place = {d.joint: d for d in rig.drive}
         self._robot, self._plan, self._mode = robot, plan, mode

@@ -8,6 +8,7 @@ from multiprocessing.connection import Connection
 from typing import Self
 
 from emulator.hub import Hub
+from emulator.priority import real_time
 from protocols.errors import ArmrigError, PeerError
 
 STOP_S = 5.0
@@ -65,6 +66,7 @@ def _run(buses: list[tuple[str, str]], pipe: Connection) -> None:
         pipe.poll(None)
         hub.stop()
 
+    real_time()
     with hub:
         pipe.send(hub.channels)
         threading.Thread(target=until_the_owner_is_gone, daemon=True).start()

@@ -53,50 +53,57 @@ class Punctuality:
 
     Attributes:
         cycles: SYNC periods.
+        seconds: Real time they took.
         late: Cycles that began more than a tenth of a period after their time.
+        slipped: Cycles that were more than a period late: the grid was shifted, no burst of SYNCs made up for it.
         worst_s: Largest lateness.
         unanswered: Cycles that began before every drive had answered the one before.
     """
 
     cycles: int
+    seconds: float
     late: int
+    slipped: int
     worst_s: float
     unanswered: int
 
     def __str__(self) -> str:
         return (
-            f"{self.cycles} cycles, {self.late} late by more than a tenth of a period"
-            f" (worst {self.worst_s * 1e3:.2f} ms), {self.unanswered} without an answer from every drive"
+            f"{self.cycles} cycles in {self.seconds:.2f} s; {self.late} late by more than a tenth of a period,"
+            f" {self.slipped} by more than a period (worst {self.worst_s * 1e3:.2f} ms);"
+            f" {self.unanswered} without an answer from every drive"
         )
 
 
 def move(host: Host, buses: Sequence[FrameBus], clock: Clock, stop: threading.Event, period_ns: int) -> Punctuality:
-    """Run a host's script in real time. A late cycle shifts the grid: SYNCs are never sent in a burst to catch up.
+    """Run a host's script in real time, SYNC on a fixed grid; a cycle late by more than a period shifts the grid.
 
     Raises:
         PeerError: A drive does not answer or has a fault, or a bus has gone.
     """
     script = host.script()
     frames = next(script)
-    cycles = late = unanswered = worst_ns = 0
-    due_ns = clock.now_ns()
+    cycles = late = slipped = unanswered = worst_ns = 0
+    begin_ns = due_ns = clock.now_ns()
     while True:
         _send(buses, frames)
         due_ns += period_ns
         inbox, missing = _gather(host, buses, clock, due_ns, due_ns + FEEDBACK_PATIENCE_PERIODS * period_ns)
-        late_ns = clock.now_ns() - due_ns
+        now_ns = clock.now_ns()
+        late_ns = now_ns - due_ns
         cycles += 1
         unanswered += missing > 0
         worst_ns = max(worst_ns, late_ns)
-        if late_ns > period_ns // 10:
-            late += 1
-            due_ns += late_ns
+        late += late_ns > period_ns // 10
+        if late_ns > period_ns:
+            slipped += 1
+            due_ns = now_ns
         if stop.is_set():
             host.stop()
         try:
             frames = script.send(inbox)
         except StopIteration:
-            return Punctuality(cycles, late, worst_ns * 1e-9, unanswered)
+            return Punctuality(cycles, (now_ns - begin_ns) * 1e-9, late, slipped, worst_ns * 1e-9, unanswered)
 
 
 def _gather(
