@@ -48,5 +48,5 @@ class SimClock:
 
 
 def utc_now_ns() -> int:
-    """Date of the run, for `RunStart` alone: everything else counts from the run's start [ns since 1970]."""
+    """Date [ns since 1970], for `RunStart` and python-can messages: all else counts from the run's start."""
     return time.time_ns()
