@@ -10,7 +10,7 @@ import sys
 import threading
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -446,7 +446,15 @@ def identify(
     given = None if robot is None else load_robot(robot)
     runs = [read_recording(Path(r), given) for r in recordings]
     unseen = [read_recording(Path(r), given) for r in validate or []]
-    found = run([signals(r) for r in runs], runs[0].robot, method.split(","), [signals(r) for r in unseen])
+    with progress() as told:
+        found = run(
+            [signals(r) for r in runs],
+            runs[0].robot,
+            method.split(","),
+            [signals(r) for r in unseen],
+            truth=known_parameters(truth),
+            progress=told,
+        )
     deliver(
         json,
         html,
@@ -455,6 +463,17 @@ def identify(
         render(found).encode() if html else b"",
         model_file(found[0]).encode() if model_out else b"",
     )
+
+
+def known_parameters(robot_file: str | None) -> dict[str, float]:
+    """Base parameters of a `--truth` file by name; none without one."""
+    from ident.identify import truth_values
+    from protocols.robot import load as load_robot
+
+    if robot_file is None:
+        return {}
+    machine = load_robot(robot_file)
+    return truth_values(machine, machine)
 
 
 def deliver(
@@ -487,10 +506,11 @@ def serve(
     """Run the identification service until Ctrl-C."""
     from importlib.metadata import version
 
-    from ident.zenoh_service import serve as run
+    from ident.zenoh_service import ZenohService
 
-    with stopping() as stop:
-        run(listen, version("armrig"), stop, lambda: log(f"identification service is running at {listen}"))
+    with stopping() as stop, closing(ZenohService(listen, version("armrig"), log)):
+        log(f"identification service is running at {listen}")
+        stop.wait()
 
 
 request_app = typer.Typer(no_args_is_help=True, help="Ask a service.")
@@ -510,7 +530,8 @@ def request_identify(
     model_out: ModelOption = None,
 ) -> None:
     """Dynamic parameters of recordings, computed by a service."""
-    answer = ask(recordings, validate or [], connect, robot, method, html=bool(html), model=bool(model_out))
+    parts = {"html": bool(html), "model": bool(model_out)}
+    answer = ask(recordings, validate or [], connect, robot, method, known_parameters(truth), **parts)
     deliver(json, html, model_out, answer["result"], answer.get("html", b""), answer.get("model", b""))
 
 
@@ -520,10 +541,10 @@ def ask(
     endpoint: str,
     robot: str | None,
     method: str,
+    truth: dict[str, float],
     *,
     html: bool,
     model: bool,
-    truth: dict[str, float] | None = None,
 ) -> dict[str, bytes]:
     """Parts of a service's answer by name.
 
@@ -543,7 +564,7 @@ def ask(
         robot_toml=None if robot is None else config.to_toml(load_robot(robot)),
         html=html,
         model=model,
-        truth=truth or {},
+        truth=truth,
     )
     with progress() as told:
         return request(endpoint, wanted, body, told).parts
@@ -557,7 +578,7 @@ def refer(names: Sequence[str]) -> "tuple[list[Attached | Logged], bytes]":
     """
     from protocols import messages
 
-    references: list[Attached | Logged] = []
+    references: list[messages.Attached | messages.Logged] = []
     body = b""
     for name in names:
         path = Path(name)

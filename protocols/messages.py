@@ -13,6 +13,7 @@ denied): a missing `Done` is therefore the one sign of failure that needs no gue
 """
 
 import hashlib
+import re
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
@@ -32,7 +33,8 @@ PEER_TIMEOUT_S = 3.0  # silence after which a client gives up on finding a servi
 
 T = TypeVar("T")
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,127}$")]
-LogId = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]  # an index entry, never a path
+_LOG_ID = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
+LogId = Annotated[str, Meta(pattern=_LOG_ID)]  # an index entry, never a path
 Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
 Count = Annotated[int, Meta(ge=0)]
 
@@ -60,6 +62,11 @@ def identify_key(method: str) -> str:
 def log_key(log_id: str) -> str:
     """A recording offered by the log server; `*` lists all. Without parameters the reply is `LogInfo`."""
     return f"{PREFIX}/log/{log_id}"
+
+
+def is_log_id(text: str) -> bool:
+    """Whether a log could have this id."""
+    return re.fullmatch(_LOG_ID, text) is not None
 
 
 def alive_key(service: str) -> str:
