@@ -27,7 +27,7 @@ MAX_CHUNK_BYTES = 64 << 20  # decompressed; ours have 256 KiB, the largest seen 
 MAX_SIGNAL_BYTES = 4 << 30  # of one topic; ten hours of six drives at 1 kHz
 _HEAD = struct.Struct("<BQ")
 _INDEX_HEAD = struct.Struct("<HI")
-_INDEX_ENTRY_BYTES = 16
+_INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the data
 
 Buffer = bytes | memoryview
@@ -59,10 +59,10 @@ class Span(NamedTuple):
 
 @dataclass(slots=True)
 class ChunkSpan:
-    """A chunk and, where it is indexed, the number of its messages by channel id."""
+    """A chunk and, where it is indexed, the arrival of its messages by channel id [ns]."""
 
     span: Span
-    counts: dict[int, int] = field(default_factory=dict)
+    log_time: dict[int, NDArray[np.uint64]] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -194,8 +194,13 @@ def _note(contents: Contents, span: Span) -> None:
             contents.chunks.append(ChunkSpan(span))
         case Opcode.MESSAGE_INDEX if contents.chunks and span.end - span.start >= _INDEX_HEAD.size:
             channel, length = _INDEX_HEAD.unpack_from(buffer, span.start)
-            contents.chunks[-1].counts[channel] = length // _INDEX_ENTRY_BYTES
-        case Opcode.MESSAGE:
+            if length > span.end - span.start - _INDEX_HEAD.size or length % _INDEX_ENTRY.itemsize:
+                raise BrokenFileError(span.begin, f"has a message index of {length} bytes in a shorter record")
+            entries = np.frombuffer(
+                buffer, _INDEX_ENTRY, length // _INDEX_ENTRY.itemsize, span.start + _INDEX_HEAD.size
+            )
+            contents.chunks[-1].log_time[channel] = entries["log_time"]
+        case Opcode.MESSAGE if span.end - span.start >= MESSAGE.size:
             contents.loose.append(span)
         case Opcode.ATTACHMENT:
             attachment = parse(Attachment, buffer, span)
@@ -241,51 +246,91 @@ class Messages:
 
 
 def messages(contents: Contents, topics: Collection[str]) -> dict[str, Messages]:
-    """Messages of some topics; chunks that an index says have none of them stay closed.
+    """Messages of some topics.
 
     Raises:
         BrokenFileError: A chunk is damaged, or there is more than `MAX_SIGNAL_BYTES`.
     """
-    found: dict[str, Messages] = {topic: Messages() for topic in topics}
+    whole: dict[str, Messages] = {topic: Messages() for topic in topics}
     total = 0
-    for chunk in contents.chunks:
-        known = [contents.channels[i].topic for i in chunk.counts if i in contents.channels]
-        if len(known) == len(chunk.counts) > 0 and found.keys().isdisjoint(known):
-            continue
-        _, data = open_chunk(contents.buffer, chunk.span)
-        spans = []
-        for span in walk(data, 0, len(data)):
-            if span.opcode == Opcode.MESSAGE:
-                spans.append(span)
-            else:
-                note_channel(contents, data, span)
-        total += _gather(contents, data, spans, found)
+    for found in messages_by_chunk(contents, topics):
+        for topic, some in found.items():
+            whole[topic].blocks += some.blocks
+            whole[topic].log_time += some.log_time
+            total += sum(block.nbytes for block in some.blocks)
         if total > MAX_SIGNAL_BYTES:
-            raise BrokenFileError(chunk.span.begin, f"has more than {MAX_SIGNAL_BYTES >> 30} GiB of signals")
-    _gather(contents, contents.buffer, contents.loose, found)
-    return found
+            raise BrokenFileError(len(contents.buffer), f"has more than {MAX_SIGNAL_BYTES >> 30} GiB of signals")
+    return whole
 
 
-def _gather(contents: Contents, data: Buffer, spans: list[Span], found: dict[str, Messages]) -> int:
-    """Sort messages to their topics; returns the bytes kept."""
-    starts: dict[int, list[tuple[int, int]]] = {}
+def messages_by_chunk(contents: Contents, topics: Collection[str]) -> Iterator[dict[str, Messages]]:
+    """Messages of some topics, chunk by chunk; chunks that an index says have none of them stay closed.
+
+    Raises:
+        BrokenFileError: A chunk is damaged.
+    """
+    for chunk in contents.chunks:
+        known = [contents.channels[i].topic for i in chunk.log_time if i in contents.channels]
+        if len(known) < len(chunk.log_time) or not known or not set(topics).isdisjoint(known):
+            yield _gather(contents, *_messages_in(contents, chunk), topics)
+    yield _gather(contents, contents.buffer, contents.loose, topics)
+
+
+def arrivals(contents: Contents) -> dict[str, NDArray[np.uint64]]:
+    """Arrival of all messages by topic, in file order [ns]; from the index where there is one.
+
+    Raises:
+        BrokenFileError: A chunk that had to be opened is damaged.
+    """
+    found: dict[int, list[NDArray[np.uint64]]] = {}
+    for chunk in contents.chunks:
+        times = chunk.log_time or _times(*_messages_in(contents, chunk))
+        for channel, log_time in times.items():
+            found.setdefault(channel, []).append(log_time)
+    for channel, log_time in _times(contents.buffer, contents.loose).items():
+        found.setdefault(channel, []).append(log_time)
+    none = [np.array([], dtype=np.uint64)]
+    return {c.topic: np.concatenate(found.get(c.id, none)) for c in contents.channels.values()}
+
+
+def _times(data: Buffer, spans: list[Span]) -> dict[int, NDArray[np.uint64]]:
+    times: dict[int, list[int]] = {}
     for span in spans:
-        if span.end - span.start < MESSAGE.size:
-            raise BrokenFileError(span.begin, "has a message shorter than its head")
+        channel, _sequence, log_time, _publish_time = MESSAGE.unpack_from(data, span.start)
+        times.setdefault(channel, []).append(log_time)
+    return {channel: np.array(log_time, dtype=np.uint64) for channel, log_time in times.items()}
+
+
+def _messages_in(contents: Contents, chunk: ChunkSpan) -> tuple[bytes, list[Span]]:
+    """Records of a chunk and where its messages are; its schemas and channels are noted."""
+    _, data = open_chunk(contents.buffer, chunk.span)
+    spans = []
+    for span in walk(data, 0, len(data)):
+        if span.opcode != Opcode.MESSAGE:
+            note_channel(contents, data, span)
+        elif span.end - span.start < MESSAGE.size:
+            raise BrokenFileError(chunk.span.begin, "has a message shorter than its head")
+        else:
+            spans.append(span)
+    return data, spans
+
+
+def _gather(contents: Contents, data: Buffer, spans: list[Span], topics: Collection[str]) -> dict[str, Messages]:
+    """Sort messages to their topics, equal sizes together."""
+    found: dict[str, Messages] = {}
+    places: dict[str, list[tuple[int, int]]] = {}
+    for span in spans:
         channel, _sequence, log_time, _publish_time = MESSAGE.unpack_from(data, span.start)
         if channel not in contents.channels:
             raise BrokenFileError(span.begin, f"has a message of the unknown channel {channel}")
-        topic = found.get(contents.channels[channel].topic)
-        if topic is not None:
-            topic.log_time.append(log_time)
-            starts.setdefault(channel, []).append((span.start + MESSAGE.size, span.end))
+        topic = contents.channels[channel].topic
+        if topic in topics:
+            found.setdefault(topic, Messages()).log_time.append(log_time)
+            places.setdefault(topic, []).append((span.start + MESSAGE.size, span.end))
     raw = np.frombuffer(data, dtype=np.uint8)
-    kept = 0
-    for channel, places in starts.items():
-        begin, end = np.array(places).T
+    for topic, where in places.items():
+        begin, end = np.array(where).T
         size = end - begin
         for run in np.split(np.arange(len(size)), np.flatnonzero(np.diff(size)) + 1):
-            block = raw[begin[run][:, None] + np.arange(size[run[0]])]
-            found[contents.channels[channel].topic].blocks.append(block)
-            kept += block.nbytes
-    return kept
+            found[topic].blocks.append(raw[begin[run][:, None] + np.arange(size[run[0]])])
+    return found
