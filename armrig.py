@@ -21,7 +21,7 @@ from protocols.errors import ArmrigError, ConfigError
 
 if TYPE_CHECKING:
     from emulator.rig import EmulatedRig
-    from protocols.messages import Attached, Logged
+    from protocols.messages import Attached, Logged, Method
     from protocols.motion import Motion
     from protocols.rig import Rig
     from protocols.robot import Robot
@@ -450,7 +450,7 @@ def identify(
         found = run(
             [signals(r) for r in runs],
             runs[0].robot,
-            method.split(","),
+            methods_of(method),
             [signals(r) for r in unseen],
             truth=known_parameters(truth),
             progress=told,
@@ -463,6 +463,20 @@ def identify(
         render(found).encode() if html else b"",
         model_file(found[0]).encode() if model_out else b"",
     )
+
+
+def methods_of(text: str) -> "list[Method]":
+    """Methods of `--method`.
+
+    Raises:
+        ConfigError: One of them is unknown.
+    """
+    from protocols.messages import METHODS, Method
+
+    try:
+        return msgspec.convert(text.split(","), list[Method])
+    except msgspec.ValidationError:
+        raise ConfigError(f"--method {text}: choose from {', '.join(METHODS)}, separated by commas.") from None
 
 
 def known_parameters(robot_file: str | None) -> dict[str, float]:
@@ -558,7 +572,7 @@ def ask(
     references, body = refer([*runs, *validation])
     wanted = messages.IdentifyRequest(
         id=uuid.uuid4().hex,
-        methods=method.split(","),  # type: ignore[arg-type] - checked by the service, whose methods may be newer
+        methods=methods_of(method),
         runs=references[: len(runs)],
         validation=references[len(runs) :],
         robot_toml=None if robot is None else config.to_toml(load_robot(robot)),

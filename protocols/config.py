@@ -15,7 +15,7 @@ T = TypeVar("T", bound=msgspec.Struct)
 SHIPPED = "library"  # package folder with the robots, rigs and motions that come with armrig
 
 
-class Table(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base of every configuration table: immutable, unknown keys are errors."""
 
 

@@ -32,7 +32,7 @@ class Reference(msgspec.Struct, frozen=True):
     qdd: NDArray[np.float64]
 
 
-class Fourier(config.Table, kw_only=True, tag="fourier", tag_field="kind"):
+class Fourier(config.Table, frozen=True, kw_only=True, tag="fourier", tag_field="kind"):
     """Periodic Fourier series of Swevers et al. 1997 (also Bona & Curatella, eq. (17)-(19)), blended in and out
     by fifth-order polynomials.
 
@@ -50,7 +50,7 @@ class Fourier(config.Table, kw_only=True, tag="fourier", tag_field="kind"):
     cosine_rad: list[list[float]]
 
 
-class Points(config.Table, kw_only=True, tag="polynomial5", tag_field="kind"):
+class Points(config.Table, frozen=True, kw_only=True, tag="polynomial5", tag_field="kind"):
     """Fifth-order polynomials between via points, at rest in each (Khalil & Dombre, Modeling, ch. 13).
 
     Attributes:
@@ -64,7 +64,7 @@ class Points(config.Table, kw_only=True, tag="polynomial5", tag_field="kind"):
     dwell_s: Annotated[float, Meta(ge=0)] = 0.0
 
 
-class Trapezoid(config.Table, kw_only=True, tag="trapezoid", tag_field="kind"):
+class Trapezoid(config.Table, frozen=True, kw_only=True, tag="trapezoid", tag_field="kind"):
     """Trapezoidal speed between via points: slow ramps for gravity, bang-bang for friction (where no axis gets to
     its speed).
 
@@ -80,7 +80,7 @@ class Trapezoid(config.Table, kw_only=True, tag="trapezoid", tag_field="kind"):
     dwell_s: Annotated[float, Meta(ge=0)] = 0.0
 
 
-class Standstill(config.Table, kw_only=True, tag="standstill", tag_field="kind"):
+class Standstill(config.Table, frozen=True, kw_only=True, tag="standstill", tag_field="kind"):
     """Hold the last position."""
 
     duration_s: Positive
@@ -89,7 +89,7 @@ class Standstill(config.Table, kw_only=True, tag="standstill", tag_field="kind")
 Segment = Fourier | Points | Trapezoid | Standstill
 
 
-class Motion(config.Table, kw_only=True):
+class Motion(config.Table, frozen=True, kw_only=True):
     """One motion.
 
     Attributes:
@@ -213,8 +213,9 @@ def sample(motion: Motion, robot: Robot, dt: float, start: NDArray[np.float64] |
                 pieces.append(_hold(b, segment.dwell_s, dt))
             here = points[-1]
     q, qd, qdd = (np.concatenate([piece[k] for piece in pieces]) for k in range(3))
+    t_s: NDArray[np.float64] = np.arange(len(q)) * dt
     _check_limits(motion.name, q, qd, robot)
-    return Reference(np.arange(len(q)) * dt, q, qd, qdd)
+    return Reference(t_s, q, qd, qdd)
 
 
 def _first_position(segment: Segment) -> NDArray[np.float64] | None:

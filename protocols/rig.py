@@ -17,7 +17,7 @@ FULL_BUS = 1.0  # worst-case share above which no hardware can carry the traffic
 BUSY_BUS = 0.8  # share above which a warning is due: vendors advise at most 70 to 80 %
 
 
-class Bus(config.Table, kw_only=True):
+class Bus(config.Table, frozen=True, kw_only=True):
     """One CAN bus.
 
     Attributes:
@@ -33,7 +33,7 @@ class Bus(config.Table, kw_only=True):
     bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 1_000_000
 
 
-class DriveNode(config.Table, kw_only=True):
+class DriveNode(config.Table, frozen=True, kw_only=True):
     """Where one axis' drive is."""
 
     joint: str
@@ -41,7 +41,7 @@ class DriveNode(config.Table, kw_only=True):
     node: NodeId
 
 
-class Pdo(config.Table, kw_only=True):
+class Pdo(config.Table, frozen=True, kw_only=True):
     """Objects in the two cyclic PDOs, `index:subindex/bits` in hexadecimal, configured by the host at start.
 
     Attributes:
@@ -53,7 +53,7 @@ class Pdo(config.Table, kw_only=True):
     target: tuple[str, ...] = ("6071:0/16", "607A:0/32")
 
 
-class Cell(config.Table, kw_only=True):
+class Cell(config.Table, frozen=True, kw_only=True):
     """The cell's Modbus/TCP device."""
 
     host: str = "127.0.0.1"
@@ -62,20 +62,20 @@ class Cell(config.Table, kw_only=True):
     poll_Hz: Annotated[float, Meta(gt=0, le=100)] = 20.0
 
 
-class Recorder(config.Table, kw_only=True):
+class Recorder(config.Table, frozen=True, kw_only=True):
     """How recordings are written. Bounded loss: at most `flush_ms` of data when the power goes."""
 
     chunk_bytes: Annotated[int, Meta(ge=4096, le=16 * 2**20)] = 256 * 1024
     flush_ms: Annotated[int, Meta(ge=10, le=10_000)] = 250
 
 
-class Zenoh(config.Table, kw_only=True):
+class Zenoh(config.Table, frozen=True, kw_only=True):
     """Endpoint of the identification service; explicit, no multicast scouting."""
 
     endpoint: str = "tcp/127.0.0.1:7447"
 
 
-class Emulated(config.Table, kw_only=True):
+class Emulated(config.Table, frozen=True, kw_only=True):
     """What only the emulator knows. Never attached to a recording.
 
     Attributes:
@@ -93,7 +93,7 @@ class Emulated(config.Table, kw_only=True):
     effect: list[EffectEntry] = []
 
 
-class Rig(config.Table, kw_only=True):
+class Rig(config.Table, frozen=True, kw_only=True):
     """One test rig.
 
     Attributes:

@@ -25,7 +25,7 @@ Vector6 = tuple[float, float, float, float, float, float]
 INERTIAL = ("m", "mx", "my", "mz", "xx", "xy", "xz", "yy", "yz", "zz")  # order of a link's ten parameters
 
 
-class Drive(config.Table, kw_only=True):
+class Drive(config.Table, frozen=True, kw_only=True):
     """Motor, gear and power stage of one axis; what the CiA 402 device of that axis is built from.
 
     Attributes:
@@ -62,7 +62,7 @@ class Drive(config.Table, kw_only=True):
         return self.drive_gain_Nm_A / abs(self.gear_ratio)
 
 
-class Control(config.Table, kw_only=True):
+class Control(config.Table, frozen=True, kw_only=True):
     """PD law of Janot et al. 2014, eq. (19)-(21): v = (kp kv (qr - q) - kv dq) J / g, with kp = w/(2 z), kv = 2 z w.
 
     Attributes:
@@ -76,7 +76,7 @@ class Control(config.Table, kw_only=True):
     inertia_kgm2: Positive
 
 
-class Parameters(config.Table, kw_only=True):
+class Parameters(config.Table, frozen=True, kw_only=True):
     """Dynamic parameters of one link and its axis, inertia at the origin of the link frame.
 
     Attributes:
@@ -105,7 +105,7 @@ class Parameters(config.Table, kw_only=True):
         return np.array([self.mass_kg, *self.first_moment_kgm, *self.inertia_kgm2])
 
 
-class Joint(config.Table, kw_only=True):
+class Joint(config.Table, frozen=True, kw_only=True):
     """One axis: where it is, what it may do, what drives it.
 
     Attributes:
@@ -140,7 +140,7 @@ class Joint(config.Table, kw_only=True):
             raise ValueError(f"{self.name}: gear_ratio must not be 0")
 
 
-class EffectEntry(config.Table, kw_only=True):
+class EffectEntry(config.Table, frozen=True, kw_only=True):
     """One physical effect beyond rigid bodies with viscous and Coulomb friction.
 
     Attributes:
@@ -154,7 +154,7 @@ class EffectEntry(config.Table, kw_only=True):
     parameters: dict[str, float] = msgspec.field(default_factory=dict)
 
 
-class Robot(config.Table, kw_only=True):
+class Robot(config.Table, frozen=True, kw_only=True):
     """One arm.
 
     Attributes:
