@@ -122,15 +122,15 @@ class Device:
         self.timers.now_ns = t_ns
         if t_ns >= self.timers.next_ns:
             self.timers.run()
-        if self.state is nmt.State.OPERATIONAL:
+        operational = self.state is nmt.State.OPERATIONAL
+        if operational or self.state is nmt.State.PRE_OPERATIONAL:
             self._check_sync_length(counter)
+        if operational:
             self._pdos.activate()
-            self._application.update()
+        self._application.update()
+        if operational:
             self._pdos.transmit()
             self._pdos.check_events()
-        elif self.state is nmt.State.PRE_OPERATIONAL:
-            self._check_sync_length(counter)
-            self._application.update()
         return self._flush()
 
     def tick(self, t_ns: int) -> list[Frame]:

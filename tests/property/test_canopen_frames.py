@@ -51,9 +51,7 @@ frames = st.one_of(
     ),
 )
 counters = st.one_of(st.none(), st.integers(0, 255))
-measurements = st.builds(
-    Measurement, st.integers(-(2**40), 2**40), st.integers(-(2**40), 2**40), st.floats(-1e9, 1e9)
-)
+measurements = st.builds(Measurement, st.integers(-(2**40), 2**40), st.integers(-(2**40), 2**40), st.floats(-1e9, 1e9))
 steps = st.one_of(
     frames,
     frames,

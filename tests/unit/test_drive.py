@@ -455,3 +455,13 @@ def test_controlword_by_sdo(bench) -> None:
     for word in (0x06, 0x07, 0x0F):
         bench.run(sdo.Download(0x6040, 0, struct.pack("<H", word)))
     assert bench.drive.state is State.OPERATION_ENABLED
+
+
+def test_a_ramp_that_ends_at_a_sync_of_a_stopped_node(bench) -> None:
+    drive = moving(bench, 2)
+    bench.control(0x02, Mode.CST)
+    bench.nmt(nmt.Command.STOP)
+    bench.sync(100 + BRAKE_DELAY_NS // MS + 1)
+    assert drive.state is State.SWITCH_ON_DISABLED and drive.command().mode == 0
+    bench.nmt(nmt.Command.ENTER_PRE_OPERATIONAL)
+    assert bench.statusword == 0x0240

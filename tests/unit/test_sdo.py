@@ -9,7 +9,12 @@ class Memory:
     """Objects without types: what was written can be read; 0x2000 has four bytes, 0x3000 is read-only."""
 
     def __init__(self) -> None:
-        self.values = {(0x2000, 0): b"\1\2\3\4", (0x2001, 0): b"", (0x3000, 0): b"fixed", (0x2002, 1): bytes(range(200))}
+        self.values = {
+            (0x2000, 0): b"\1\2\3\4",
+            (0x2001, 0): b"",
+            (0x3000, 0): b"fixed",
+            (0x2002, 1): bytes(range(200)),
+        }
 
     def read(self, index: int, sub: int) -> bytes:
         if (index, sub) not in self.values:
