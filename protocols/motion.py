@@ -213,7 +213,7 @@ def sample(motion: Motion, robot: Robot, dt: float, start: NDArray[np.float64] |
                 pieces.append(_hold(b, segment.dwell_s, dt))
             here = points[-1]
     q, qd, qdd = (np.concatenate([piece[k] for piece in pieces]) for k in range(3))
-    t_s: NDArray[np.float64] = np.arange(len(q)) * dt
+    t_s = dt * np.arange(len(q), dtype=np.float64)
     _check_limits(motion.name, q, qd, robot)
     return Reference(t_s, q, qd, qdd)
 
