@@ -200,7 +200,7 @@ class Drive:
     # --- emulator.device.Application ---
 
     def reset(self) -> None:
-        self.state = State.SWITCH_ON_DISABLED  # self-test passed: transitions 0 and 1
+        self.state = TRANSITIONS[State.NOT_READY_TO_SWITCH_ON, Event.INITIALISED]  # the self-test takes no time
         self._controlword = 0
         self._mode = self._requested_mode = int(Mode.NONE)
         self._ramp: _Ramp | None = None

@@ -7,7 +7,7 @@ from emulator.emergency import EmergencyProducer
 from emulator.store import ObjectStore
 from emulator.timers import Timers
 from protocols import emcy, nmt
-from protocols.dictionary import INVALID, NO_RTR, PDOS
+from protocols.dictionary import INVALID, NO_RTR
 from protocols.frames import Frame
 from protocols.objects import Entry, Value, key
 from protocols.pdo import (
@@ -22,6 +22,8 @@ from protocols.pdo import (
 from protocols.sdo import Abort, SdoError
 
 Handler = Callable[[bytes], bool]
+
+_MOST = 512  # PDOs of each direction that a dictionary has room for
 
 
 class _Receive:
@@ -94,21 +96,20 @@ class PdoEngine:
         self._synchronous_receive: list[_Receive] = []
         self._synchronous_transmit: list[_Transmit] = []
         self._on_event: list[_Transmit] = []
-        for n in range(PDOS):
-            for base in (RECEIVE, TRANSMIT):
-                consequence = partial(self._changed, base, n)
-                store.guard(base + n, partial(self._check_communication, base, n), consequence)
-                mapping = base + MAPPING_OFFSET + n
-                store.guard(mapping, partial(self._check_mapping, base, n), consequence)
+        objects = store.dictionary.objects
+        self._present = [(base, n) for base in (RECEIVE, TRANSMIT) for n in range(_MOST) if base + n in objects]
+        for base, n in self._present:
+            consequence = partial(self._changed, base, n)
+            store.guard(base + n, partial(self._check_communication, base, n), consequence)
+            store.guard(base + MAPPING_OFFSET + n, partial(self._check_mapping, base, n), consequence)
 
     # --- life ---
 
     def start(self) -> None:
         """Take all PDOs into use; event-driven ones are sent with the next `check_events`."""
         self._running = True
-        for n in range(PDOS):
-            self._build(RECEIVE, n)
-            self._build(TRANSMIT, n)
+        for base, n in self._present:
+            self._build(base, n)
         self._sort()
 
     def stop(self) -> None:

@@ -39,7 +39,7 @@ frames = st.one_of(
     downloads(),
     st.builds(lambda a: Frame(0x600 + NODE, sdo.Upload(*a).request()), addresses),
     st.builds(lambda d: Frame(0x600 + NODE, d), anything),
-    st.builds(lambda c, n: nmt.command(c, n), st.sampled_from(nmt.Command), st.sampled_from([0, NODE, 6])),
+    st.builds(nmt.command, st.sampled_from(nmt.Command), st.sampled_from([0, NODE, 6])),
     st.builds(lambda w, m: Frame(0x200 + NODE, struct.pack("<Hb", w, m)), words, st.sampled_from([0, 8, 10, 9])),
     st.builds(lambda d: Frame(0x300 + NODE, d), anything),
     st.builds(lambda n, d: Frame(0x700 + n, d), st.sampled_from([NODE, 127]), anything),

@@ -7,8 +7,11 @@ import struct
 
 import pytest
 
+from emulator.device import Device
 from protocols import nmt, pdo, sdo
+from protocols.dictionary import communication_objects
 from protocols.frames import ERROR, EXTENDED, REMOTE, Frame
+from protocols.objects import Dictionary
 from protocols.sdo import Abort
 
 START, STOP = nmt.Command.START, nmt.Command.STOP
@@ -452,3 +455,12 @@ def test_access(bench) -> None:
 
 def test_identity(bench) -> None:
     assert [bench.read_int(0x1018, i) for i in range(5)] == [4, 0, 0x4152_4D52, 0x0001_0000, 5]
+
+
+def test_device_without_an_application() -> None:
+    device = Device(Dictionary(communication_objects()), 9)
+    assert device.start(0) == [Frame(0x709, b"\0")]
+    for command in nmt.Command:
+        device.receive(0, nmt.command(command, 9))
+    assert device.receive(0, Frame(0x609, sdo.Upload(0x1000).request()))[0].can_id == 0x589
+    assert device.sync(0, 1) == device.tick(10**9) == []
