@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 
@@ -35,7 +36,10 @@ class LogServer:
         except PeerError:
             self._shelf.close()
             raise
-        self._queryable = self._session.declare_queryable(messages.log_key("*"), self._on_query)
+        # One queryable per log: several servers may stand at one router, and a list is what all of them answer.
+        self._queryables = [
+            self._session.declare_queryable(messages.log_key(key), partial(self._on_query, key)) for key in self.keys
+        ]
         # Last, since a client looks for it before it asks; kept, since a dropped token is undeclared.
         self._token = self._session.liveliness().declare_token(messages.alive_key("log"))
 
@@ -50,17 +54,17 @@ class LogServer:
     def close(self) -> None:
         """Withdraw the offer."""
         self._token.undeclare()  # type: ignore[no-untyped-call]
-        self._queryable.undeclare()  # type: ignore[no-untyped-call]
+        for queryable in self._queryables:
+            queryable.undeclare()  # type: ignore[no-untyped-call]
         self._session.close()  # type: ignore[no-untyped-call]
         self._shelf.close()
 
-    def _on_query(self, query: zenoh.Query) -> None:
-        log_id = str(query.key_expr).rpartition("/")[2]
+    def _on_query(self, log_id: str, query: zenoh.Query) -> None:
         pairs = (part.partition("=") for part in str(query.parameters).split(";") if part)
         with query:  # a query that is kept alive after its replies ends in a timeout at the client
             try:
-                for key, payload in self._shelf.answer(log_id, {name: value for name, _, value in pairs}):
-                    query.reply(key, payload)
+                payload = self._shelf.answer(log_id, {name: value for name, _, value in pairs})
+                query.reply(messages.log_key(log_id), payload)
             except ArmrigError as error:
                 query.reply_err(messages.encode(messages.failure(error)))
             except Exception as error:  # noqa: BLE001  (top loop: a bug must end this query, not the server)
@@ -85,5 +89,5 @@ def _client(endpoint: str) -> zenoh.Session:
     except zenoh.ZError as error:
         raise PeerError(
             f"No Zenoh router answers at {endpoint} for the recordings to be offered; start `armrig serve` first."
-            f" ({str(error).splitlines()[0].partition(" at /")[0]})"
+            f" ({str(error).splitlines()[0].partition(' at /')[0]})"
         ) from error

@@ -13,7 +13,6 @@ from protocols.errors import DataError
 _NOT_IN_ID = re.compile(r"[^A-Za-z0-9_-]+")
 _LONGEST_STEM = 56  # of a log id's 64, so that a number fits behind it
 _HASHED_BYTES = 1 << 20
-_EVERYTHING = "*"
 
 
 class Shelf:
@@ -32,31 +31,29 @@ class Shelf:
     def ids(self) -> list[str]:
         return list(self._logs)
 
-    def answer(self, log_id: str, parameters: Mapping[str, str]) -> list[tuple[str, bytes]]:
-        """Replies to a get: pairs (key, payload).
+    def answer(self, log_id: str, parameters: Mapping[str, str]) -> bytes:
+        """Payload of the reply to a get.
 
         Args:
-            log_id: Last part of the key; `*` lists all.
             parameters: Empty for the description, else those of a range.
 
         Raises:
             DataError: No such log, or it has changed on disk.
             ConfigError: Not a valid range.
         """
-        if log_id == _EVERYTHING:
-            return [(messages.log_key(name), messages.encode(info)) for name, (info, _) in self._logs.items()]
         if log_id not in self._logs:
             offered = ", ".join(self._logs) or "none"
             raise DataError(f"There is no log {log_id[:64]!r}; offered are {offered}.")
         info, descriptor = self._logs[log_id]
         if not parameters:
-            return [(messages.log_key(log_id), messages.encode(info))]
+            return messages.encode(info)
         wanted = messages.parse_range(dict(parameters))
         if wanted.offset > info.bytes:
             raise DataError(f"Log {log_id} has {info.bytes} bytes; there are none from {wanted.offset} on.")
         body = os.pread(descriptor, min(wanted.count, info.bytes - wanted.offset), wanted.offset)
-        reply = messages.RangeReply(id=log_id, offset=wanted.offset, bytes=len(body), total_bytes=info.bytes)
-        return [(messages.log_key(log_id), messages.encode(reply, body))]
+        return messages.encode(
+            messages.RangeReply(id=log_id, offset=wanted.offset, bytes=len(body), total_bytes=info.bytes), body
+        )
 
     def close(self) -> None:
         for _, descriptor in self._logs.values():

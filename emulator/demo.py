@@ -65,7 +65,7 @@ class Demo:
         for name in MOTIONS:
             recorder = record(name, rig_file, endpoint)
             offered = recorder.wait_for("offered as", RUN_S)
-            self._log(recorder.line(str(self._recording(name))))
+            self._log(recorder.line(f"{self._recording(name)}: "))
             keys.append(re.findall(r"offered as (\S+)", offered)[0])
         self._log(f"identifying {MOTIONS[0]}, predicting {MOTIONS[1]}")
         files = [str(self._out / f) for f in ("result.json", "report.html", "identified.toml")]
