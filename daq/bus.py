@@ -7,24 +7,27 @@ from typing import Self
 import can
 
 from protocols.clock import Clock
-from protocols.errors import PeerError
 from protocols.frames import Frame
-from protocols.pythoncan import from_message
+from protocols.pythoncan import cannot_open, from_message, lost
 from protocols.rig import Bus
+
+MAX_BATCH = 4096  # messages taken at once, so that a flooded bus cannot starve the others
+BLIND_POLL_S = 0.001  # for interfaces without a descriptor to wait on
 
 
 class Listener:
     """One bus, received in batches with arrival stamps."""
 
-    def __init__(self, name: str, opened: can.BusABC, clock: Clock) -> None:
-        self.name = name
+    def __init__(self, bus: Bus, opened: can.BusABC, clock: Clock) -> None:
+        self.name = bus.name
+        self._config = bus
         self._bus = opened
         self._clock = clock
         # The hub's interface offers whole batches; every other one gives a message at a time.
         self._batch: Callable[[float], list[Frame]] | None = getattr(opened, "read_frames", None)
 
     def receive(self) -> list[tuple[int, Frame]]:
-        """What has arrived, without waiting: pairs (arrival [ns], frame).
+        """What has arrived, without waiting: pairs (arrival [ns], frame). Frames of one read share a stamp.
 
         Raises:
             PeerError: The bus has gone.
@@ -32,48 +35,62 @@ class Listener:
         try:
             frames = self._batch(0) if self._batch is not None else self._messages()
         except (can.CanError, OSError) as error:
-            raise PeerError(f"bus {self.name}: {error}") from error
+            raise lost(self._config, error) from error
         t_ns = self._clock.now_ns()
         return [(t_ns, frame) for frame in frames]
 
     def _messages(self) -> list[Frame]:
-        frames = []
-        while (message := self._bus.recv(0)) is not None:
+        frames: list[Frame] = []
+        while len(frames) < MAX_BATCH and (message := self._bus.recv(0)) is not None:
             frames.append(from_message(message))
         return frames
+
+    @property
+    def blind(self) -> bool:
+        """Whether there is no descriptor to wait on: such a bus must be polled."""
+        try:
+            self._bus.fileno()
+        except NotImplementedError:
+            return True
+        return False
 
     def fileno(self) -> int:
         """Descriptor to wait on."""
         return self._bus.fileno()
 
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.shutdown()
+
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._bus.shutdown()
+        self.close()
 
 
 def open_listener(bus: Bus, clock: Clock) -> Listener:
     """Listen to a bus of a rig.
 
     Raises:
-        PeerError: It does not exist, or python-can has no such interface.
+        PeerError: It does not exist, nobody serves it, or python-can has no such interface; says what to do.
     """
     try:
-        if bus.interface == "virtualcan":
-            opened = can.Bus(interface="virtualcan", channel=bus.channel)
-        else:
-            opened = can.Bus(bus.channel, bus.interface, ignore_config=True, bitrate=bus.bitrate)
+        # python-can finds `virtualcan` by its entry point; the module is the emulator's and is not imported here.
+        opened = can.Bus(bus.channel, bus.interface, ignore_config=True, bitrate=bus.bitrate)
     except (can.CanError, OSError, ValueError) as error:
-        raise PeerError(f"bus {bus.name}: {bus.interface}:{bus.channel} cannot be opened: {error}") from error
-    return Listener(bus.name, opened, clock)
+        raise cannot_open(bus, error) from error
+    return Listener(bus, opened, clock)
 
 
 def wait_any(listeners: Sequence[Listener], timeout_s: float) -> list[list[tuple[int, Frame]]]:
-    """Wait until a bus has frames, then take what all of them have.
+    """Wait until a bus has frames, then take what all of them have. Blind buses are looked at every millisecond.
 
     Raises:
         PeerError: A bus has gone.
     """
-    ready = select.select(listeners, [], [], timeout_s)[0]
-    return [listener.receive() if listener in ready else [] for listener in listeners]
+    waited_for = [listener for listener in listeners if not listener.blind]
+    if len(waited_for) < len(listeners):
+        timeout_s = min(timeout_s, BLIND_POLL_S)
+    ready = select.select(waited_for, [], [], timeout_s)[0]
+    return [one.receive() if one in ready or one not in waited_for else [] for one in listeners]

@@ -1,6 +1,7 @@
 """Edge: the buses of a rig as rig and host use them, whatever carries them."""
 
 import errno
+import logging
 import select
 from collections.abc import Sequence
 from typing import Self
@@ -9,32 +10,43 @@ import can
 
 from emulator.virtualcan import VirtualCanBus
 from protocols.clock import Clock, RealClock
-from protocols.errors import PeerError
 from protocols.frames import Frame
-from protocols.pythoncan import from_message, to_message
+from protocols.pythoncan import cannot_open, from_message, lost, to_message
 from protocols.rig import Bus
 
-RETRY_NS = 1_000_000  # a full transmit queue (ENOBUFS) empties by itself: a frame takes 0.1 ms at 1 Mbit/s
-GIVE_UP_NS = 1_000_000_000  # a queue that stays full for so long means a bus that acknowledges nothing
+LOG = logging.getLogger("armrig.bus")
+
+# A full transmit queue (ENOBUFS) is a busy bus for a moment, a bus that acknowledges nothing when it lasts.
+RETRY_NS = 1_000_000  # a frame takes 0.1 ms at 1 Mbit/s
+DROP_NS = 10_000_000  # a command this late is worth less than the next one
+GIVE_UP_NS = 1_000_000_000
+MAX_BATCH = 1024  # messages taken at once, so that a flooded bus cannot hold its reader
+BLIND_POLL_S = 0.001  # for interfaces without a descriptor to wait on
 
 
 class FrameBus:
     """One open bus that moves batches of frames.
 
     Virtualcan goes a batch at a time, every other interface of python-can a message at a time.
+
+    Attributes:
+        dropped: Frames given up because the transmit queue stayed full.
     """
 
-    def __init__(self, name: str, opened: can.BusABC, clock: Clock) -> None:
-        self.name = name
+    def __init__(self, bus: Bus, opened: can.BusABC, clock: Clock) -> None:
+        self.name = bus.name
+        self.dropped = 0
+        self._config = bus
         self._bus = opened
         self._hub = opened if isinstance(opened, VirtualCanBus) else None
         self._clock = clock
+        self._full_since_ns: int | None = None
 
     def send(self, frames: Sequence[Frame]) -> None:
-        """Send in order.
+        """Send in order. A frame that finds the transmit queue full for 10 ms is dropped, counted and logged.
 
         Raises:
-            PeerError: The bus has gone, or acknowledges nothing.
+            PeerError: The bus has gone, or has acknowledged nothing for a second.
         """
         try:
             if self._hub is not None:
@@ -43,18 +55,34 @@ class FrameBus:
                 for frame in frames:
                     self._send_one(frame)
         except (can.CanError, OSError) as error:
-            raise PeerError(f"bus {self.name}: {error}") from error
+            raise lost(self._config, error) from error
 
     def _send_one(self, frame: Frame) -> None:
-        end_ns = self._clock.now_ns() + GIVE_UP_NS
-        while True:
-            try:
-                self._bus.send(to_message(frame))
+        begin_ns = self._clock.now_ns()
+        while not self._accepted(frame):
+            now_ns = self._clock.now_ns()
+            if now_ns - begin_ns >= DROP_NS:
+                self.dropped += 1
+                LOG.warning("bus %s: queue full; frame %X dropped, %d so far", self.name, frame.can_id, self.dropped)
                 return
-            except can.CanOperationError as error:
-                if error.error_code != errno.ENOBUFS or self._clock.now_ns() > end_ns:
-                    raise
-            self._clock.sleep_until(self._clock.now_ns() + RETRY_NS)
+            self._clock.sleep_until(now_ns + RETRY_NS)
+
+    def _accepted(self, frame: Frame) -> bool:
+        """Whether the transmit queue took the frame.
+
+        Raises:
+            CanOperationError: It has been full for too long, or the bus has gone.
+        """
+        try:
+            self._bus.send(to_message(frame))
+        except can.CanOperationError as error:
+            now_ns = self._clock.now_ns()
+            self._full_since_ns = now_ns if self._full_since_ns is None else self._full_since_ns
+            if not _queue_is_full(error) or now_ns - self._full_since_ns > GIVE_UP_NS:
+                raise
+            return False
+        self._full_since_ns = None
+        return True
 
     def receive(self) -> list[Frame]:
         """What has arrived, without waiting.
@@ -65,47 +93,65 @@ class FrameBus:
         try:
             if self._hub is not None:
                 return self._hub.read_frames(0)
-            frames = []
-            while (message := self._bus.recv(0)) is not None:
+            frames: list[Frame] = []
+            while len(frames) < MAX_BATCH and (message := self._bus.recv(0)) is not None:
                 frames.append(from_message(message))
             return frames
         except (can.CanError, OSError) as error:
-            raise PeerError(f"bus {self.name}: {error}") from error
+            raise lost(self._config, error) from error
+
+    @property
+    def blind(self) -> bool:
+        """Whether there is no descriptor to wait on: such a bus must be polled."""
+        try:
+            self._bus.fileno()
+        except NotImplementedError:
+            return True
+        return False
 
     def fileno(self) -> int:
         """Descriptor to wait on."""
         return self._bus.fileno()
 
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.shutdown()
+
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._bus.shutdown()
+        self.close()
+
+
+def _queue_is_full(error: can.CanOperationError) -> bool:
+    # python-can says it in words when select() finds the socket not writable.
+    return error.error_code == errno.ENOBUFS or "Transmit buffer full" in str(error)
 
 
 def open_bus(bus: Bus) -> FrameBus:
     """Join a bus of a rig.
 
     Raises:
-        PeerError: It does not exist, or python-can has no such interface.
+        PeerError: It does not exist, nobody serves it, or python-can has no such interface; says what to do.
     """
     try:
         if bus.interface == "virtualcan":
-            return FrameBus(bus.name, VirtualCanBus(bus.channel), RealClock())
+            return FrameBus(bus, VirtualCanBus(bus.channel), RealClock())
         opened = can.Bus(bus.channel, bus.interface, ignore_config=True, bitrate=bus.bitrate)
     except (can.CanError, OSError, ValueError) as error:
-        advice = ""
-        if bus.interface == "socketcan":
-            advice = f" Create it with: ip link add {bus.channel} type vcan && ip link set {bus.channel} up."
-        raise PeerError(f"bus {bus.name}: {bus.interface}:{bus.channel} cannot be opened: {error}.{advice}") from error
-    return FrameBus(bus.name, opened, RealClock())
+        raise cannot_open(bus, error) from error
+    return FrameBus(bus, opened, RealClock())
 
 
 def receive_any(buses: Sequence[FrameBus], timeout_s: float) -> list[list[Frame]]:
-    """Wait until a bus has frames, then take what all of them have.
+    """Wait until a bus has frames, then take what all of them have. Blind buses are looked at every millisecond.
 
     Raises:
         PeerError: A bus has gone.
     """
-    ready = select.select(buses, [], [], timeout_s)[0]
-    return [bus.receive() if bus in ready else [] for bus in buses]
+    waited_for = [bus for bus in buses if not bus.blind]
+    if len(waited_for) < len(buses):
+        timeout_s = min(timeout_s, BLIND_POLL_S)
+    ready = select.select(waited_for, [], [], timeout_s)[0]
+    return [bus.receive() if bus in ready or bus not in waited_for else [] for bus in buses]

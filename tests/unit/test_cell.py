@@ -281,7 +281,7 @@ def test_a_cell_that_accepts_and_says_nothing_is_reported() -> None:
 
 def test_a_torn_read_is_an_event_and_no_sample() -> None:
     """A cell that is always between two updates: by hand, since pymodbus cannot be made to tear."""
-    words = encode(STATE, 1, 8)[0][:-1] + [9]
+    words = [*encode(STATE, 1, 8)[0][:-1], 9]
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
         def serve() -> None:
