@@ -209,6 +209,7 @@ class RealTime:
 
 def emulate_on_buses(rig_name: str, moved: Sequence[str], duration: float | None, seed: int | None) -> None:
     from emulator.bus import open_bus
+    from emulator.cell import CellServer
     from emulator.hubprocess import HubProcess
     from emulator.priority import real_time
     from emulator.shell import emulate as run
@@ -223,14 +224,14 @@ def emulate_on_buses(rig_name: str, moved: Sequence[str], duration: float | None
         opened = [msgspec.structs.replace(b, channel=channels.get(b.name, b.channel)) for b in rig.bus]
         buses = [stack.enter_context(open_bus(b)) for b in opened]
         stop = stack.enter_context(stopping())
-        cell = None
+        cell = None if rig.cell is None else CellServer(rig.cell, arm.cell())
         if cell is not None:
             cell.start()
             stack.callback(cell.stop)
         places = ", ".join(f"{b.name} {b.interface}:{b.channel}" for b in opened)
         log(f"{rig.name} is running on {places}" + (f", cell on {rig.cell.host}:{rig.cell.port}" if rig.cell else ""))
         real_time()
-        run(arm, buses, RealClock(), stop, duration, None if cell is None else lambda t_ns: cell.update(arm.cell(t_ns)))
+        run(arm, buses, RealClock(), stop, duration, None if cell is None else lambda: cell.update(arm.cell()))
     log(f"{arm.cycles} cycles; {arm.skewed} at which a bus had no SYNC")
 
 
@@ -333,7 +334,7 @@ def open_listeners(rig: "Rig", clock: Any, stack: ExitStack) -> list[Any]:
 
 
 def start_poller(rig: "Rig", clock: Any, writer: Any, stack: ExitStack) -> None:
-    return
+    from daq.cell import CellPoller
 
     if rig.cell is not None:
         poller = CellPoller(rig.cell, clock, writer.put)

@@ -13,6 +13,7 @@ import numpy as np
 from emulator.drive import Drive, Measurement
 from emulator.plant import Plant
 from protocols import nmt
+from protocols.cell import CellState
 from protocols.frames import Frame
 from protocols.rig import Rig
 from protocols.robot import Robot
@@ -68,6 +69,7 @@ class EmulatedRig:
             )
             for bus in rig.bus
         ]
+        self._supply_V = max(joint.drive.bus_voltage_V for joint in machine.joint)
         self._mode = np.zeros(joints, dtype=np.int64)
         self._position = np.zeros(joints)
         self._current = np.zeros(joints)
@@ -106,6 +108,15 @@ class EmulatedRig:
             for _, drive in segment.drives:
                 sent.extend(drive.tick(t_ns))
         return out
+
+    def cell(self) -> CellState:
+        """What the cell's sensors see of the machine."""
+        return CellState(
+            motor_temperature_C=tuple(self.plant.motor_temperature_C.tolist()),
+            ambient_temperature_C=self.plant.ambient_C,
+            supply_V=self._supply_V,
+            brake_released=bool(self._mode.all()),
+        )
 
     def _dispatch(self, t_ns: int, segment: _Segment, sent: list[Frame]) -> None:
         """Everything up to the next SYNC."""

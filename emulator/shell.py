@@ -20,7 +20,7 @@ def emulate(
     clock: Clock,
     stop: threading.Event,
     duration_s: float | None = None,
-    every_100_ms: Callable[[int], None] | None = None,
+    every_100_ms: Callable[[], None] | None = None,
 ) -> None:
     """Run the emulated rig on its buses until stopped.
 
@@ -35,7 +35,7 @@ def emulate(
         t_ns = clock.now_ns()
         _send(buses, rig.step(t_ns, received))
         if t_ns >= next_update and every_100_ms is not None:
-            every_100_ms(t_ns)
+            every_100_ms()
             next_update = t_ns + 100_000_000
         if end_ns is not None and t_ns >= end_ns:
             return
