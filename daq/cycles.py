@@ -47,6 +47,7 @@ class SyncLine:
     Attributes:
         index: Of the last SYNC; None before the first.
         counter, t_ns: What it carried (None: no counter), when it arrived.
+        repeated: The counter came again: a duplicate, unless the drives tell of a whole turn that was lost.
         ahead: Drives whose last TPDO1 claims a SYNC that has not been seen: either it was lost, or the drive's index
             was learnt from a late TPDO1. The next SYNC tells.
     """
@@ -55,6 +56,7 @@ class SyncLine:
     index: int | None = None
     counter: int | None = None
     t_ns: int = 0
+    repeated: bool = False
     ahead: set["DriveLine"] = field(default_factory=set)
 
 
@@ -154,12 +156,13 @@ class Assembler:
             step = (counter - line.counter) % self._overflow
             if step == 0:
                 line.counters.duplicated += 1
+                line.repeated = True
                 return
             if line.ahead:
                 self._explain(line, line.index + step)
             line.counters.lost += step - 1
             line.index += step
-        line.counter, line.t_ns = counter, t_ns
+        line.counter, line.t_ns, line.repeated = counter, t_ns, False
         line.counters.syncs += 1
         line.counters.uncounted += counter is None
         if self._foremost is None or line.index > self._foremost:
@@ -261,7 +264,10 @@ class Assembler:
             turns = round(surplus / self._overflow)
             if turns > 0:
                 line.index += turns * self._overflow
-                line.counters.lost += turns * self._overflow
+                line.counters.lost += turns * self._overflow - line.repeated
+                line.counters.syncs += line.repeated
+                line.counters.duplicated -= line.repeated
+                line.repeated = False
                 coming += turns * self._overflow
             elif surplus > 0:
                 drive.shift(-surplus)

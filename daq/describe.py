@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocols import topics
-from protocols.container import BrokenFileError, Contents, arrivals, messages, scan
+from protocols.container import BrokenFileError, Contents, scan
 from protocols.errors import DataError
+from protocols.gather import arrivals, messages
 from protocols.recording import damage, map_file, verdict
 
 _NS = 1e-9

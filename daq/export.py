@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from daq.replay import Batch, Merge, bus_of, to_frames
 from protocols.candump import format_frame
-from protocols.container import BrokenFileError, messages_by_chunk, scan
+from protocols.container import BrokenFileError, scan
 from protocols.errors import ConfigError, DataError
+from protocols.gather import messages_by_chunk
 from protocols.recording import Recording, damage, map_file, read_recording
 from protocols.robot import Robot
 

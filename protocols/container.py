@@ -7,7 +7,7 @@ its announced size and CRC, and the data section against its own. Record content
 
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import NamedTuple, TypeVar
@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 MAGIC = MCAP0_MAGIC
 MAX_CHUNK_BYTES = 64 << 20  # decompressed; ours have 256 KiB, the largest seen elsewhere 4 MiB
-MAX_SIGNAL_BYTES = 4 << 30  # of one topic; ten hours of six drives at 1 kHz
 _HEAD = struct.Struct("<BQ")
 _INDEX_HEAD = struct.Struct("<HI")
 _INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
@@ -163,27 +162,41 @@ def scan(buffer: Buffer) -> Contents:
     end = len(buffer) - len(MAGIC)
     if end <= len(MAGIC) or bytes(buffer[end:]) != MAGIC:
         raise BrokenFileError(len(buffer), "ends before its recording was complete", truncated=True)
-    contents: Contents | None = None
-    footer: Span | None = None
-    ended = False
-    for span in walk(buffer, len(MAGIC), end):
-        if span.opcode == Opcode.HEADER and contents is None:
-            contents = Contents(buffer, parse(Header, buffer, span))
-        elif contents is None:
-            raise BrokenFileError(span.begin, "does not start with a header")
-        elif span.opcode == Opcode.DATA_END:
+    spans = walk(buffer, len(MAGIC), end)
+    first = next(spans)
+    if first.opcode != Opcode.HEADER:
+        raise BrokenFileError(first.begin, "does not start with a header")
+    contents = Contents(buffer, parse(Header, buffer, first))
+    for span in spans:
+        if span.opcode == Opcode.DATA_END:
             crc = parse(DataEnd, buffer, span).data_section_crc
             if crc not in (0, zlib.crc32(buffer[: span.begin])):
                 raise BrokenFileError(span.begin, "has a wrong checksum over its data")
-            ended = True
-        elif span.opcode == Opcode.FOOTER:
+            _read_summary(contents, spans)
+            return contents
+        _note(contents, span)
+    raise BrokenFileError(end, "ends before its recording was complete", truncated=True)
+
+
+def _read_summary(contents: Contents, spans: Iterator[Span]) -> None:
+    """The summary repeats the schemas and channels that foreign files have inside of chunks."""
+    buffer, footer = contents.buffer, None
+    for span in spans:
+        note_channel(contents, buffer, span)
+        if span.opcode == Opcode.FOOTER:
             footer = span
-        elif not ended:
-            _note(contents, span)
-    if contents is None or footer is None or not ended:
-        raise BrokenFileError(end, "ends before its recording was complete", truncated=True)
-    _check_summary(buffer, footer)
-    return contents
+    if footer is None:
+        raise BrokenFileError(len(buffer), "ends before its recording was complete", truncated=True)
+    about = parse(Footer, buffer, footer)
+    start = about.summary_start or footer.begin
+    if not len(MAGIC) < start <= footer.begin:
+        raise BrokenFileError(footer.begin, "has a footer that points outside of the file")
+    crc = zlib.crc32(buffer[start : footer.end - 4])  # the summary and the footer up to its own CRC
+    if about.summary_crc not in (0, crc):
+        raise BrokenFileError(start, "has a wrong checksum over its summary")
+    if not contents.channels:  # it need not repeat them
+        for chunk in contents.chunks:
+            messages_in(contents, chunk)
 
 
 def _note(contents: Contents, span: Span) -> None:
@@ -222,86 +235,7 @@ def note_channel(contents: Contents, buffer: Buffer, span: Span) -> None:
         contents.channels[channel.id] = channel
 
 
-def _check_summary(buffer: Buffer, span: Span) -> None:
-    footer = parse(Footer, buffer, span)
-    start = footer.summary_start or span.begin
-    if not len(MAGIC) < start <= span.begin:
-        raise BrokenFileError(span.begin, "has a footer that points outside of the file")
-    crc = zlib.crc32(buffer[start : span.end - 4])  # the summary and the footer up to its own CRC
-    if footer.summary_crc not in (0, crc):
-        raise BrokenFileError(start, "has a wrong checksum over its summary")
-
-
-@dataclass(slots=True)
-class Messages:
-    """Messages of one channel.
-
-    Attributes:
-        blocks: Runs of messages of equal size, in file order, each of shape (n, size).
-        log_time: shape (N,) over all blocks [ns].
-    """
-
-    blocks: list[NDArray[np.uint8]] = field(default_factory=list)
-    log_time: list[int] = field(default_factory=list)
-
-
-def messages(contents: Contents, topics: Collection[str]) -> dict[str, Messages]:
-    """Messages of some topics.
-
-    Raises:
-        BrokenFileError: A chunk is damaged, or there is more than `MAX_SIGNAL_BYTES`.
-    """
-    whole: dict[str, Messages] = {topic: Messages() for topic in topics}
-    total = 0
-    for found in messages_by_chunk(contents, topics):
-        for topic, some in found.items():
-            whole[topic].blocks += some.blocks
-            whole[topic].log_time += some.log_time
-            total += sum(block.nbytes for block in some.blocks)
-        if total > MAX_SIGNAL_BYTES:
-            raise BrokenFileError(len(contents.buffer), f"has more than {MAX_SIGNAL_BYTES >> 30} GiB of signals")
-    return whole
-
-
-def messages_by_chunk(contents: Contents, topics: Collection[str]) -> Iterator[dict[str, Messages]]:
-    """Messages of some topics, chunk by chunk; chunks that an index says have none of them stay closed.
-
-    Raises:
-        BrokenFileError: A chunk is damaged.
-    """
-    for chunk in contents.chunks:
-        known = [contents.channels[i].topic for i in chunk.log_time if i in contents.channels]
-        if len(known) < len(chunk.log_time) or not known or not set(topics).isdisjoint(known):
-            yield _gather(contents, *_messages_in(contents, chunk), topics)
-    yield _gather(contents, contents.buffer, contents.loose, topics)
-
-
-def arrivals(contents: Contents) -> dict[str, NDArray[np.uint64]]:
-    """Arrival of all messages by topic, in file order [ns]; from the index where there is one.
-
-    Raises:
-        BrokenFileError: A chunk that had to be opened is damaged.
-    """
-    found: dict[int, list[NDArray[np.uint64]]] = {}
-    for chunk in contents.chunks:
-        times = chunk.log_time or _times(*_messages_in(contents, chunk))
-        for channel, log_time in times.items():
-            found.setdefault(channel, []).append(log_time)
-    for channel, log_time in _times(contents.buffer, contents.loose).items():
-        found.setdefault(channel, []).append(log_time)
-    none = [np.array([], dtype=np.uint64)]
-    return {c.topic: np.concatenate(found.get(c.id, none)) for c in contents.channels.values()}
-
-
-def _times(data: Buffer, spans: list[Span]) -> dict[int, NDArray[np.uint64]]:
-    times: dict[int, list[int]] = {}
-    for span in spans:
-        channel, _sequence, log_time, _publish_time = MESSAGE.unpack_from(data, span.start)
-        times.setdefault(channel, []).append(log_time)
-    return {channel: np.array(log_time, dtype=np.uint64) for channel, log_time in times.items()}
-
-
-def _messages_in(contents: Contents, chunk: ChunkSpan) -> tuple[bytes, list[Span]]:
+def messages_in(contents: Contents, chunk: ChunkSpan) -> tuple[bytes, list[Span]]:
     """Records of a chunk and where its messages are; its schemas and channels are noted."""
     _, data = open_chunk(contents.buffer, chunk.span)
     spans = []
@@ -313,24 +247,3 @@ def _messages_in(contents: Contents, chunk: ChunkSpan) -> tuple[bytes, list[Span
         else:
             spans.append(span)
     return data, spans
-
-
-def _gather(contents: Contents, data: Buffer, spans: list[Span], topics: Collection[str]) -> dict[str, Messages]:
-    """Sort messages to their topics, equal sizes together."""
-    found: dict[str, Messages] = {}
-    places: dict[str, list[tuple[int, int]]] = {}
-    for span in spans:
-        channel, _sequence, log_time, _publish_time = MESSAGE.unpack_from(data, span.start)
-        if channel not in contents.channels:
-            raise BrokenFileError(span.begin, f"has a message of the unknown channel {channel}")
-        topic = contents.channels[channel].topic
-        if topic in topics:
-            found.setdefault(topic, Messages()).log_time.append(log_time)
-            places.setdefault(topic, []).append((span.start + MESSAGE.size, span.end))
-    raw = np.frombuffer(data, dtype=np.uint8)
-    for topic, where in places.items():
-        begin, end = np.array(where).T
-        size = end - begin
-        for run in np.split(np.arange(len(size)), np.flatnonzero(np.diff(size)) + 1):
-            found[topic].blocks.append(raw[begin[run][:, None] + np.arange(size[run[0]])])
-    return found

@@ -15,8 +15,9 @@ import numpy as np
 
 from protocols import config, signals, topics
 from protocols.cdr import MessageType
-from protocols.container import BrokenFileError, Contents, messages, scan
+from protocols.container import BrokenFileError, Contents, scan
 from protocols.errors import ConfigError, DataError
+from protocols.gather import messages
 from protocols.rig import Rig
 from protocols.robot import Robot
 from protocols.signals import CellSignals, DriveSignals, Flags, Floats, Ints

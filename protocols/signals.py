@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocols.cdr import Block, MessageType
-from protocols.container import Messages
 from protocols.errors import DataError
+from protocols.gather import Messages
 from protocols.robot import Robot
 from protocols.topics import Event
 
