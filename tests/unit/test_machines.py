@@ -69,7 +69,7 @@ def base_parameters(robot: Robot) -> dict[str, float]:
     for j in range(6):
         shared = p[5].motor_viscous_Nms_rad if j >= 4 else 0.0
         base[f"Fv{j + 1}"] = p[j].viscous_Nms_rad + shared
-        base[f"Fc{j + 1}"] = p[j].coulomb_Nm
+        base[f"Fc{j + 1}"] = p[j].coulomb_Nm + (p[5].motor_coulomb_Nm if j == 5 else 0.0)
     base["fv_m6"], base["fc_m6"] = p[5].motor_viscous_Nms_rad, p[5].motor_coulomb_Nm
     return base
 
