@@ -78,7 +78,7 @@ def open_listener(bus: Bus, clock: Clock) -> Listener:
     try:
         # python-can finds `virtualcan` by its entry point; the module is the emulator's and is not imported here.
         opened = can.Bus(bus.channel, bus.interface, ignore_config=True, bitrate=bus.bitrate)
-    except (can.CanError, OSError, ValueError) as error:
+    except (can.CanError, NotImplementedError, OSError, ValueError) as error:
         raise cannot_open(bus, error) from error
     return Listener(bus, opened, clock)
 

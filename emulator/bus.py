@@ -139,7 +139,7 @@ def open_bus(bus: Bus) -> FrameBus:
         if bus.interface == "virtualcan":
             return FrameBus(bus, VirtualCanBus(bus.channel), RealClock())
         opened = can.Bus(bus.channel, bus.interface, ignore_config=True, bitrate=bus.bitrate)
-    except (can.CanError, OSError, ValueError) as error:
+    except (can.CanError, NotImplementedError, OSError, ValueError) as error:
         raise cannot_open(bus, error) from error
     return FrameBus(bus, opened, RealClock())
 

@@ -11,6 +11,7 @@ import os
 import selectors
 import signal
 import socket
+import stat
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from types import FrameType
@@ -250,14 +251,20 @@ def _listen(name: str, channel: Channel) -> socket.socket:
 
 
 def _remove_stale(path: str) -> None:
-    """Unlink a unix socket left behind by a hub that was killed; one that still answers makes `bind` fail."""
+    """Unlink a unix socket left behind by a hub that was killed; one that still answers makes `bind` fail.
+
+    Raises:
+        FileExistsError: There is something else of that name.
+    """
+    if not os.path.lexists(path):
+        return
+    if not stat.S_ISSOCK(os.lstat(path).st_mode):
+        raise FileExistsError(errno.EEXIST, "there is a file of that name that is no socket")
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         try:
             probe.connect(path)
         except ConnectionRefusedError:
             os.unlink(path)
-        except FileNotFoundError:
-            pass
 
 
 def _bound(listener: socket.socket) -> Channel:

@@ -11,7 +11,7 @@ from protocols.frames import ERROR, EXTENDED, ID_MASK, REMOTE, Frame
 _LARGEST_SHORT = 0x7FF
 _LONG_DIGITS = 8  # identifiers of 29 bits, and error frames with their flag
 _LINE = re.compile(
-    r"\((\d+)\.(\d{1,9})\)\s+(\S+)\s+([0-7][0-9A-F]{2}|[0-9A-F]{8})#"
+    r"\s*\((\d+)\.(\d{1,9})\)\s+(\S+)\s+([0-7][0-9A-F]{2}|[0-9A-F]{8})#"
     r"(R[0-8]?|(?:[0-9A-F]{2}){0,8})(?:\s+[RT])?\s*",  # newer candump -x appends received or transmitted
     re.IGNORECASE | re.ASCII,
 )

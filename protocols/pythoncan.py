@@ -40,7 +40,7 @@ def cannot_open(bus: Bus, error: Exception) -> PeerError:
     """Error for a bus that could not be joined, with what to do about it."""
     where = f"bus {bus.name} ({bus.interface} {bus.channel})"
     reason = str(error).rstrip(".")
-    if isinstance(error, can.CanInterfaceNotImplementedError):
+    if isinstance(error, NotImplementedError):
         return PeerError(f"{where}: python-can offers no such interface: {reason}. Correct it in the rig file.")
     if bus.interface == "socketcan":
         return PeerError(
