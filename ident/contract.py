@@ -75,6 +75,20 @@ class Simulation(msgspec.Struct, frozen=True):
     torque_error_percent: list[float]
 
 
+class Iterate(msgspec.Struct, frozen=True):
+    """One iteration of a method that simulates.
+
+    Attributes:
+        beta: Base parameters, in the order of the result.
+        position_error_percent: ||q - qs|| / ||q|| of the simulation at them, per joint (Janot et al. 2014, Table 5).
+        residual_norm: Weighted, of eq. (27) or of the output error.
+    """
+
+    beta: list[float]
+    position_error_percent: list[float]
+    residual_norm: float
+
+
 class Result(msgspec.Struct, frozen=True, kw_only=True):
     """One method's answer.
 
@@ -83,6 +97,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
         relations: How standard parameters regroup into the base parameters.
         covariance: How the standard deviations were made.
         condition_number: Of W with its columns scaled to length 1; `condition_number_raw` of W itself.
+        history: Iterations, the start first; empty for closed forms.
         physically_consistent: None: not examined (base parameters alone do not tell).
     """
 
@@ -104,6 +119,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     relations: list[str]
     recordings: list[Run]
     notes: list[str]
+    history: list[Iterate] = []
 
 
 def to_json(results: list[Result]) -> bytes:

@@ -1,4 +1,4 @@
-"""IDIM-OLS and IDIM-WLS (Janot, Vandanjon & Gautier 2014, II.D and II.E) on per-joint triangular factors.
+"""Estimates, and the least-squares methods IDIM-OLS and IDIM-WLS (Janot, Vandanjon & Gautier 2014, II.D and II.E).
 
 Each joint's rows are first reduced to the triangle R of QR([W_j y_j]); nothing of the data is lost, and weighting
 joint j by 1/sigma_j is a division of its triangle. No second pass over the data, whatever their length.
@@ -6,19 +6,23 @@ joint j by 1/sigma_j is a division of its triangle. No second pass over the data
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from ident.base import Base
+from ident.contract import Iterate, Statistic
 from ident.covariance import hac
 from ident.observation import Observation, relative_error
+from ident.system import System, triangle
 from protocols.errors import IdentificationError
+
+if TYPE_CHECKING:
+    from ident.problem import Problem
 
 Array = NDArray[np.float64]
 
-METHODS = {"ols": "IDIM-OLS", "wls": "IDIM-WLS"}
 DEFICIENT = 1e-8  # singular value, columns scaled to 1, below which a motion does not show a combination
 ROUNDING = 1e-13  # of the largest column: smaller ones are zeros of the structure
 SHOWN_SHARE = 0.1  # weight of a parameter in an unseen combination from which on it is named
@@ -34,15 +38,19 @@ class Estimate:
         beta: Values, shape (b,).
         std: Standard deviations from `covariance`, shape (b,).
         covariance: shape (b, b); how it was made is `covariance_name`.
-        white: Covariance of eq. (8), which holds for serially uncorrelated errors only, shape (b, b).
-        sigma_Nm: Standard deviation of the error per joint, from the joint's own sub-system, shape (J,).
-        triangle: R of QR([W y]) weighted by the method, shape (b+1, b+1).
+        white: Covariance that holds for serially uncorrelated errors only, as eq. (8), shape (b, b).
+        sigma_Nm: Standard deviation of the torque error per joint, shape (J,).
+        system: Weighted linear system that beta solves, for model reduction; None where there is none.
         relative_error_percent, per_joint_percent: ||Y - W beta|| / ||Y||, over all rows and per joint.
         residual_rms_Nm: shape (J,).
         rows: Used, all joints.
         condition, condition_scaled: Of W, and of W with columns scaled to length 1.
         lag1: Autocorrelation of the residual at lag 1, per joint.
         notes: What the reader should know.
+        iterations: Of the method; 1 for closed forms.
+        converged: False where the values are those of the last iteration all the same.
+        history: Every iteration, the start first; empty for closed forms.
+        tests: Statistics that only this method offers.
     """
 
     method: str
@@ -53,7 +61,7 @@ class Estimate:
     covariance_name: str
     white: Array
     sigma_Nm: Array
-    triangle: Array
+    system: System | None
     relative_error_percent: float
     per_joint_percent: Array
     residual_rms_Nm: Array
@@ -62,6 +70,10 @@ class Estimate:
     condition_scaled: float
     lag1: Array
     notes: list[str]
+    iterations: int = 1
+    converged: bool = True
+    history: tuple[Iterate, ...] = ()
+    tests: tuple[Statistic, ...] = ()
 
     @property
     def relative_std_percent(self) -> Array:
@@ -83,68 +95,138 @@ class Estimate:
         return "\n".join([head, f"standard deviations: {self.covariance_name}", *table, *self.notes])
 
 
-def estimate(observations: Sequence[Observation], base: Base, method: str = "wls") -> Estimate:
-    """Least squares over all rows used.
+@dataclass(frozen=True)
+class LeastSquares:
+    """IDIM-OLS or IDIM-WLS.
 
-    Args:
-        method: A key of `METHODS`.
+    Attributes:
+        weighted: Every joint by the standard deviation of its own sub-system, eq. (5)-(6).
+    """
+
+    weighted: bool
+
+    @property
+    def name(self) -> str:
+        return "IDIM-WLS" if self.weighted else "IDIM-OLS"
+
+    def fit(self, problem: "Problem") -> Estimate:
+        """Least squares over all rows used.
+
+        Raises:
+            IdentificationError: The motion does not show some base parameters; names them.
+        """
+        return _least_squares(problem.observations, problem.base, problem.triangles, self)
+
+
+def estimate(observations: Sequence[Observation], base: Base, method: str = "wls") -> Estimate:
+    """IDIM-WLS (`wls`) or IDIM-OLS (`ols`) of observations alone.
 
     Raises:
         IdentificationError: The motion does not show some base parameters; names them.
     """
-    joints = len(observations[0].joints)
-    b = len(base.names)
-    triangles = [
-        triangle([np.column_stack([o.W[j, o.used[j]], o.y[j, o.used[j]]]) for o in observations]) for j in range(joints)
+    return _least_squares(observations, base, joint_triangles(observations), LeastSquares(method == "wls"))
+
+
+def joint_triangles(observations: Sequence[Observation]) -> list[Array]:
+    """R of QR([W_j y_j]) of every joint over all recordings, J of shape (b+1, b+1)."""
+    return [
+        triangle([np.column_stack([o.W[j, o.used[j]], o.y[j, o.used[j]]]) for o in observations])
+        for j in range(len(observations[0].joints))
     ]
-    counts = np.array([sum(int(o.used[j].sum()) for o in observations) for j in range(joints)])
+
+
+def joint_rows(observations: Sequence[Observation]) -> NDArray[np.int64]:
+    """Rows used per joint, shape (J,)."""
+    return np.asarray(sum(o.used.sum(axis=1) for o in observations))
+
+
+def _least_squares(
+    observations: Sequence[Observation], base: Base, triangles: Sequence[Array], method: LeastSquares
+) -> Estimate:
+    joints, b = len(observations[0].joints), len(base.names)
     whole = triangle(triangles)
-    scaled, condition = _conditions(whole[:, :b])
-    _refuse_deficient(whole[:, :b], base, observations)
-    sigma = np.array([_joint_sigma(t, n) for t, n in zip(triangles, counts, strict=True)])
-    if method == "ols":
-        freedom = max(1, counts.sum() - b)
-        sigma_used = np.full(joints, _residual_norm(whole, b) / np.sqrt(freedom))
-    else:
-        sigma_used = sigma
-    weighted = triangle([t / s for t, s in zip(triangles, sigma_used, strict=True)])
-    R = weighted[:b, :b]
-    beta = linalg.solve_triangular(R, weighted[:b, b])
-    inverse = linalg.solve_triangular(R, np.eye(b))
-    white = inverse @ inverse.T
-    covariance, lags = hac(observations, beta, sigma_used, inverse)
+    refuse_deficient(whole[:, :b], base, observations)
+    counts = joint_rows(observations)
+    sigma = joint_sigma(triangles, counts)
+    freedom = max(1, int(counts.sum()) - b)
+    used = sigma if method.weighted else np.full(joints, _residual_norm(whole, b) / np.sqrt(freedom))
+    system = System.of_triangle(triangle([t / s for t, s in zip(triangles, used, strict=True)]))
+    solution = system.solve()
+    covariance, lags = hac(observations, solution.beta, used, solution.inverse)
+    return assemble(
+        observations,
+        base,
+        method.name,
+        solution.beta,
+        covariance=covariance,
+        covariance_name=f"HAC (Newey-West, Bartlett kernel, {lags} lags), joints at one instant may correlate",
+        white=solution.inverse @ solution.inverse.T,
+        sigma_Nm=sigma,
+        system=system,
+        triangles=triangles,
+    )
+
+
+def assemble(
+    observations: Sequence[Observation],
+    base: Base,
+    method: str,
+    beta: Array,
+    *,
+    covariance: Array,
+    covariance_name: str,
+    white: Array,
+    sigma_Nm: Array,
+    system: System | None = None,
+    triangles: Sequence[Array] | None = None,
+    notes: Sequence[str] = (),
+    iterations: int = 1,
+    converged: bool = True,
+    history: Sequence[Iterate] = (),
+    tests: Sequence[Statistic] = (),
+) -> Estimate:
+    """Estimate of values that a method has found: all that can be said of them on the rows Y = W beta + rho.
+
+    Args:
+        triangles: `joint_triangles(observations)`, where the method has them already.
+    """
+    b, joints = len(base.names), len(observations[0].joints)
+    scaled, condition = _conditions(triangle(triangles or joint_triangles(observations))[:, :b])
     residuals = [o.y - o.predict(beta) for o in observations]
     lag1 = np.array([_lag1(observations, residuals, j) for j in range(joints)])
     error, per_joint = relative_error(observations, beta)
-    rms = np.array([_rms(observations, residuals, j) for j in range(joints)])
     return Estimate(
-        method=METHODS[method],
+        method=method,
         base=base,
         beta=beta,
         std=np.sqrt(np.diag(covariance)),
         covariance=covariance,
-        covariance_name=f"HAC (Newey-West, Bartlett kernel, {lags} lags), joints at one instant may correlate",
+        covariance_name=covariance_name,
         white=white,
-        sigma_Nm=sigma,
-        triangle=weighted,
+        sigma_Nm=sigma_Nm,
+        system=system,
         relative_error_percent=error,
         per_joint_percent=per_joint,
-        residual_rms_Nm=rms,
-        rows=int(counts.sum()),
+        residual_rms_Nm=np.array([_rms(observations, residuals, j) for j in range(joints)]),
+        rows=int(joint_rows(observations).sum()),
         condition=condition,
         condition_scaled=scaled,
         lag1=lag1,
-        notes=[note for o in observations for note in o.notes] + _autocorrelation_note(observations[0].joints, lag1),
+        notes=[
+            *(n for o in observations for n in o.notes),
+            *_autocorrelation_note(observations[0].joints, lag1),
+            *notes,
+        ],
+        iterations=iterations,
+        converged=converged,
+        history=tuple(history),
+        tests=tuple(tests),
     )
 
 
-def triangle(blocks: Sequence[Array]) -> Array:
-    """R of the QR decomposition of stacked rows, shape (c, c); blocks may themselves be such triangles."""
-    rows = np.vstack(blocks)
-    columns = rows.shape[1]
-    if len(rows) < columns:
-        rows = np.vstack([rows, np.zeros((columns - len(rows), columns))])
-    return np.asarray(linalg.qr(rows, mode="r", check_finite=False)[0][:columns])
+def joint_sigma(triangles: Sequence[Array], rows: NDArray[np.int64]) -> Array:
+    """Standard deviation of every joint's error by its own sub-system, eq. (5), shape (J,)."""
+    return np.array([_joint_sigma(t, int(n)) for t, n in zip(triangles, rows, strict=True)])
 
 
 def _joint_sigma(factor: Array, rows: int) -> float:
@@ -171,8 +253,15 @@ def _conditions(A: Array) -> tuple[float, float]:
     return float(np.linalg.cond(A / norms)), float(np.linalg.cond(A))
 
 
-def _refuse_deficient(A: Array, base: Base, observations: Sequence[Observation]) -> None:
-    """A parameter whose column is zero or depends on others on this motion cannot be told."""
+def refuse_deficient(A: Array, base: Base, observations: Sequence[Observation]) -> None:
+    """A parameter whose column is zero or depends on others on this motion cannot be told.
+
+    Args:
+        A: Triangle of the columns, shape (b or more, b).
+
+    Raises:
+        IdentificationError: There are such parameters; names them.
+    """
     norms = np.linalg.norm(A, axis=0)
     unseen = norms <= DEFICIENT * norms.max(initial=0.0)
     _, values, rows = np.linalg.svd(A / np.where(unseen, 1.0, norms))

@@ -7,10 +7,12 @@ import numpy as np
 
 from ident import contract
 from ident.base import Base, base_parameters
-from ident.dataset import FILTER_HZ, Dataset, Signals, prepare
-from ident.estimate import METHODS, Estimate, estimate
+from ident.dataset import FILTER_HZ, Signals, prepare
+from ident.estimate import Estimate
+from ident.methods import METHODS
 from ident.model import Model
 from ident.observation import DECIMATE_TO_HZ, Observation, observe, relative_error
+from ident.problem import Problem
 from ident.reduction import Reduction, reduce
 from ident.statistics import statistics
 from protocols.clock import Clock, RealClock
@@ -72,14 +74,14 @@ def identify(
     """Identify a robot's base parameters.
 
     Args:
-        methods: Keys of `ident.estimate.METHODS`.
+        methods: Keys of `ident.methods.METHODS`.
         validation: Motions not used to fit.
         truth: Base parameters known to the caller, shown beside the estimates and used for the noise floor only.
         progress: Told how far the work is, 0 to 1.
 
     Raises:
         ConfigError: Unknown method, no recordings, or the robot has other joints than a recording.
-        DataError, IdentificationError: As `prepare`, `observe`, `estimate`.
+        DataError, IdentificationError: As `prepare`, `observe` and the method.
     """
     clock = clock or RealClock()
     _check(runs, validation, robot, methods)
@@ -88,18 +90,22 @@ def identify(
     model = Model.of(robot, offsets=settings.offsets)
     base = base_parameters(model)
     every = [*runs, *validation]
-    observations = []
+    datasets, observations = [], []
     for index, signals in enumerate(every):
         progress(0.1 + 0.6 * index / len(every), f"dataset and regressor of {signals.source}")
-        observations.append(_observe(prepare(signals, settings.filter_Hz), model, base, settings))
+        datasets.append(prepare(signals, settings.filter_Hz))
+        observations.append(observe(datasets[-1], model, base, settings.decimate_to_Hz, settings.speed_threshold_rad_s))
     seen, unseen = observations[: len(runs)], observations[len(runs) :]
+    problem = Problem(
+        model, base, runs, datasets[: len(runs)], seen, settings.decimate_to_Hz, settings.speed_threshold_rad_s
+    )
     recordings = [_run(s, "fit") for s in runs] + [_run(s, "validation") for s in validation]
     prepared_ns = clock.now_ns() - started
     out = []
     for index, method in enumerate(methods):
-        progress(0.7 + 0.3 * index / len(methods), METHODS[method])
+        progress(0.7 + 0.3 * index / len(methods), METHODS[method].name)
         begun = clock.now_ns()
-        fitted = estimate(seen, base, method)
+        fitted = METHODS[method].fit(problem)
         reduction = reduce(fitted)
         seconds = (prepared_ns + clock.now_ns() - begun) * 1e-9
         result = _result(fitted, reduction, model, seen, unseen, truth or {}, seconds, recordings)
@@ -127,10 +133,6 @@ def _check(runs: Sequence[Signals], validation: Sequence[Signals], robot: Robot,
                 f"{signals.source} has the joints {', '.join(signals.joints)}, but robot {robot.name} has"
                 f" {', '.join(robot.joint_names)}. Give the robot file of the recording."
             )
-
-
-def _observe(dataset: Dataset, model: Model, base: Base, settings: Settings) -> Observation:
-    return observe(dataset, model, base, settings.decimate_to_Hz, settings.speed_threshold_rad_s)
 
 
 def _run(signals: Signals, role: str) -> contract.Run:
@@ -178,9 +180,9 @@ def _result(
         fit=fit_quality(seen, fitted, truth),
         validation=fit_quality(unseen, fitted, truth) if unseen else None,
         simulation=None,
-        statistics=statistics(fitted, seen, reduction),
-        iterations=1,
-        converged=True,
+        statistics=[*statistics(fitted, seen, reduction), *fitted.tests],
+        iterations=fitted.iterations,
+        converged=fitted.converged,
         condition_number=fitted.condition_scaled,
         condition_number_raw=fitted.condition,
         physically_consistent=None,
@@ -189,6 +191,7 @@ def _result(
         relations=base.relations(),
         recordings=recordings,
         notes=list(dict.fromkeys(notes)),
+        history=list(fitted.history),
     )
 
 

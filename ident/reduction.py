@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import stats
 
 from ident.estimate import Estimate
 
@@ -42,11 +42,16 @@ def reduce(estimate: Estimate) -> Reduction:
     rejects too early, which keeps parameters rather than losing them.
     """
     b = len(estimate.beta)
-    R = estimate.triangle
-    full = float(R[b, b] ** 2)
+    system = estimate.system
+    if system is None:  # nothing to refit: the large relative deviations are all there is to go by
+        essential = estimate.relative_std_percent <= ESSENTIAL_PERCENT
+        beta, std = np.where(essential, estimate.beta, 0.0), np.where(essential, estimate.std, 0.0)
+        return Reduction(essential, beta, std, float("nan"), float("nan"), float("nan"), stopped_by_F=False)
+    solution = system.solve()
+    full = solution.rest
     freedom = max(1, estimate.rows - b)
     essential = np.ones(b, dtype=bool)
-    beta, std, _ = _solve(R, essential)
+    beta, std = solution.beta, solution.std
     result = Reduction(essential.copy(), beta, std, float("nan"), float("nan"), float("nan"), False)
     while essential.sum() > 1:
         relative = np.divide(100 * std, np.abs(beta), out=np.full(b, np.inf), where=beta != 0)
@@ -55,9 +60,10 @@ def reduce(estimate: Estimate) -> Reduction:
         if relative[weakest] <= ESSENTIAL_PERCENT:
             break
         essential[weakest] = False
-        beta, std, rest = _solve(R, essential)
+        solution = system.solve(essential)
+        beta, std = solution.beta, solution.std
         dropped = int(b - essential.sum())
-        F = (rest - full) / full * freedom / dropped
+        F = (solution.rest - full) / full * freedom / dropped
         limit = float(stats.f.ppf(1 - LEVEL, dropped, freedom))
         if limit < F:
             return Reduction(
@@ -66,15 +72,3 @@ def reduce(estimate: Estimate) -> Reduction:
         p_value = float(stats.f.sf(F, dropped, freedom))
         result = Reduction(essential.copy(), beta, std, float(F), limit, p_value, stopped_by_F=False)
     return result
-
-
-def _solve(R: Array, essential: NDArray[np.bool_]) -> tuple[Array, Array, float]:
-    """Least squares with some columns of a triangle: values, eq. (8) deviations (unit weight), squared residual."""
-    b = len(essential)
-    factor = linalg.qr(R[:, [*np.flatnonzero(essential), b]], mode="r")[0]
-    kept = int(essential.sum())
-    inverse = linalg.solve_triangular(factor[:kept, :kept], np.eye(kept))
-    beta, std = np.zeros(b), np.zeros(b)
-    beta[essential] = inverse @ factor[:kept, kept]
-    std[essential] = np.linalg.norm(inverse, axis=1)
-    return beta, std, float(np.sum(factor[kept:, kept] ** 2))
