@@ -82,7 +82,8 @@ class CycleRows:
 
 def cell_values(sample: CellSample) -> Mapping[str, Any]:
     """Fields of an `armrig_msgs/msg/CellIo`."""
-    return {**sample._asdict(), **topics.stamp(sample.t_ns), "header.frame_id": "cell"}
+    fields = {name.lower(): value for name, value in sample._asdict().items()}
+    return {**fields, **topics.stamp(sample.t_ns), "header.frame_id": "cell"}
 
 
 def event_values(event: Event) -> Mapping[str, Any]:

@@ -18,6 +18,8 @@ from protocols.errors import DataError
 
 PART = ".part"
 LIBRARY = f"armrig {version('armrig')}"
+_RARE = "rare"  # group of the topics that share chunks
+_RARE_TOPICS = {t.name: t.type for t in topics.TOPICS if t.name in (topics.CELL, topics.EVENTS, topics.COUNTERS)}
 
 
 class Store:
@@ -67,13 +69,13 @@ class Store:
         self._do(self._mcap.attachment, name, media_type, text.encode())
 
     def write(self, topic: str, log_time: Times, publish_time: Times, rows: Rows) -> None:
-        """Messages of one topic. Raw frames share chunks, and so does all the rest: readers skip what they can."""
-        group = "signals" if topic in _SIGNALS else "frames"
+        """Messages of one topic. Cyclic topics fill chunks of their own, in order: readers skip what they can."""
+        group = _RARE if topic in _RARE_TOPICS else topic
         self._do(self._mcap.write, group, self._channels[topic], log_time, publish_time, rows)
 
     def write_one(self, topic: str, t_ns: int, values: Mapping[str, Any]) -> None:
-        """One message of a topic that all rigs have."""
-        data = _SIGNALS[topic].encode(values)
+        """One message of a topic that is not cyclic."""
+        data = _RARE_TOPICS[topic].encode(values)
         time = np.array([t_ns], dtype=np.uint64)
         self.write(topic, time, time, np.frombuffer(data, dtype=f"V{len(data)}"))
 
@@ -105,6 +107,3 @@ class Store:
                 f"{self.path}: recording stopped, the disk refuses: {error.strerror}. {self._disk.sound} bytes are kept"
                 f" in {self.part}: make room, then run armrig recover {self.part} -o {self.path}."
             )
-
-
-_SIGNALS = {topic.name: topic.type for topic in topics.TOPICS if topic.name != topics.FRAMES}

@@ -159,9 +159,9 @@ def of_cell(kind: MessageType, found: Messages) -> CellSignals | None:
     rows = _table(kind, found)
     return CellSignals(
         t_s=rows["header.stamp.sec"] + rows["header.stamp.nanosec"] * 1e-9,
-        motor_temperature_C=rows["motor_temperature_C"].astype(float),
-        ambient_temperature_C=rows["ambient_temperature_C"].astype(float),
-        supply_V=rows["supply_V"].astype(float),
+        motor_temperature_C=rows["motor_temperature_c"].astype(float),
+        ambient_temperature_C=rows["ambient_temperature_c"].astype(float),
+        supply_V=rows["supply_v"].astype(float),
         emergency_stop=rows["emergency_stop"].astype(bool),
         brake_released=rows["brake_released"].astype(bool),
         stale=rows["stale"].astype(bool),

@@ -60,10 +60,11 @@ bool[] missing  # the drive's TPDO1 was not received: its three values are 0
 
 CELL_IO = MessageType.parse(
     "armrig_msgs/msg/CellIo",
-    f"""std_msgs/Header header
-float32[] motor_temperature_C
-float32 ambient_temperature_C
-float32 supply_V
+    f"""# ROS 2 wants lower case: temperatures in degrees Celsius, supply in volts
+std_msgs/Header header
+float32[] motor_temperature_c
+float32 ambient_temperature_c
+float32 supply_v
 bool emergency_stop
 bool brake_released
 uint16 heartbeat
@@ -181,7 +182,7 @@ class Event(NamedTuple):
 
 
 class CellSample(NamedTuple):
-    """One poll of the cell; the fields of `CELL_IO`."""
+    """One poll of the cell."""
 
     t_ns: int
     motor_temperature_C: tuple[float, ...]
