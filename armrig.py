@@ -662,5 +662,21 @@ def doctor(json: JsonOption = None) -> None:
     write_json(found, json)
 
 
+@app.command()
+def bench(json: JsonOption = None) -> None:
+    """How fast this machine runs armrig, each figure beside a peer in the same run. Quote the ratios."""
+    from daq.bench import figures as of_recorder
+    from emulator.bench import figures as of_rig
+    from ident.bench import figures as of_regressor
+
+    found = []
+    for figure in (f for figures in (of_rig, of_recorder, of_regressor) for f in figures()):
+        found.append(figure)
+        if json != "-":
+            ours, peer = f"{figure.value:.3g} {figure.unit}", f"{figure.peer_value:.3g} ({figure.peer})"
+            print(f"{figure.name:<28} {ours:>18}   {peer:<34} {figure.ratio:5.1f}x", flush=True)
+    write_json(found, json)
+
+
 if __name__ == "__main__":
     main()
