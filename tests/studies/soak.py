@@ -63,9 +63,8 @@ def main() -> None:
         about = json.loads(info.stdout)
         frames = sum(t["messages"] for topic, t in about["topics"].items() if topic.endswith("/frames"))
         print(f"recorder: {about['cycles']} cycles, {frames} frames in {about['seconds']:.1f} s,", about["verdict"])
-        print(
-            f"          {frames / about['seconds']:.0f} frames/s at {100 * recorder_s / about['seconds']:.0f} % of a core"
-        )
+        rate, share = frames / about["seconds"], 100 * recorder_s / about["seconds"]
+        print(f"          {rate:.0f} frames/s at {share:.0f} % of a core")
         raise SystemExit(about["verdict"] != "LOSSLESS")
 
 
