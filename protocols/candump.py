@@ -11,9 +11,8 @@ from protocols.frames import ERROR, EXTENDED, ID_MASK, REMOTE, Frame
 _LARGEST_SHORT = 0x7FF
 _LONG_DIGITS = 8  # identifiers of 29 bits, and error frames with their flag
 _LINE = re.compile(
-    r"\s*\((\d+)\.(\d{1,9})\)\s+(\S+)\s+([0-7][0-9A-F]{2}|[0-9A-F]{8})#"
-    r"(R[0-8]?|(?:[0-9A-F]{2}){0,8})(?:\s+[RT])?\s*",  # newer candump -x appends received or transmitted
-    re.IGNORECASE | re.ASCII,
+    r"\s*\(([0-9]+)\.([0-9]{1,9})\)\s+(\S+)\s+([0-7][0-9A-Fa-f]{2}|[0-9A-Fa-f]{8})#"
+    r"([0-9A-Fa-f]{0,16}|R[0-8]?)(?:\s+[RT])?\s*"  # newer candump -x appends received or transmitted
 )
 
 
@@ -42,7 +41,7 @@ def parse_line(text: str) -> tuple[int, str, Frame]:
         DataError: Not such a line; CAN FD frames are refused too.
     """
     match = _LINE.fullmatch(text)
-    if match is None:
+    if match is None or (len(match[5]) % 2 and match[5][0] != "R"):
         raise DataError(
             f"{text.strip()[:80]!r} is not a frame as candump -L writes it."
             " Expected a line such as: (0.001000) can0 181#0102030405060708."
@@ -52,6 +51,6 @@ def parse_line(text: str) -> tuple[int, str, Frame]:
     can_id = int(ident, 16)
     if len(ident) == _LONG_DIGITS:
         can_id = can_id & (ID_MASK | ERROR) if can_id & ERROR else can_id & ID_MASK | EXTENDED
-    if payload[:1] in ("R", "r"):
+    if payload[:1] == "R":
         return t_ns, bus, Frame(can_id | REMOTE, b"", int(payload[1:] or 0))
     return t_ns, bus, Frame(can_id, bytes.fromhex(payload))
