@@ -143,8 +143,9 @@ class Host:
         fault: PeerError | None = None
         try:
             yield from self._configure()
-            yield from self._enable()
-            yield from self._follow()
+            path = yield from self._plan_path()
+            yield from self._enable(path.q[0])
+            yield from self._follow(path)
         except PeerError as error:  # whatever one drive does, none may stay powered
             fault = error
         yield from self._disable()
@@ -255,10 +256,13 @@ class Host:
             burst[axis.bus].append(Frame(nmt.rpdo_id(2, axis.node), self._target.pack(values)))
         return burst
 
-    def _enable(self) -> Script:
+    def _plan_path(self) -> Generator[Box, Sequence[Sequence[Frame]], motion.Reference]:
+        """Reference from where the arm stands, made while the brakes hold it: enabled drives wait for no one."""
         for _ in range(3):  # the first SYNCs bring the first positions
             yield from self._cycle(self._box())
-        hold = self._measured()
+        return motion.sample(self._plan, self._robot, self._period_s, self._measured())
+
+    def _enable(self, hold: NDArray[np.float64]) -> Script:
         for _ in range(ENABLE_PERIODS):
             burst = self._aim(hold)
             for axis in self._axes:
@@ -277,8 +281,7 @@ class Host:
     def _is_enabled(self, axis: _Axis) -> bool:
         return cia402.state_of(axis.statusword) is cia402.State.OPERATION_ENABLED and axis.mode == self._mode
 
-    def _follow(self) -> Script:
-        path = motion.sample(self._plan, self._robot, self._period_s, self._measured())
+    def _follow(self, path: motion.Reference) -> Script:
         for k, reference in enumerate(path.q):
             if self._stopping:
                 yield from self._brake(reference, path.qd[k])
