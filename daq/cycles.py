@@ -217,10 +217,14 @@ class Assembler:
         if index >= self._next:
             drive.samples[index] = (position, current, 0, False)
 
-    def finish(self) -> None:
-        """The run is over: hand on what is left, and count drives that fell silent before the others."""
+    def finish(self, *, cut_off: bool = False) -> None:
+        """The run is over: hand on what is left, and count drives that fell silent before the others.
+
+        Args:
+            cut_off: Not the run is over but its recording, on each bus at another time: the silence means nothing.
+        """
         self._hand_on_all()
-        for drive in self.drives:
+        for drive in [] if cut_off else self.drives:
             if drive.silent > (HOLD if drive.counters.frames else 0):  # buses do not stop at the very same SYNC
                 drive.counters.lost += drive.silent
                 self.notes.append((drive.t_ns, drive.joint, f"no TPDO1 in the last {drive.silent} cycles"))

@@ -110,9 +110,9 @@ class Decoder:
                 self._bus_error(t_ns, bus, frame.can_id)
         self.integrity.bus[bus].frames += count
 
-    def finish(self) -> None:
-        """The run is over; what is left can be taken."""
-        self._assembler.finish()
+    def finish(self, *, cut_off: bool = False) -> None:
+        """The run is over, or its recording was cut off; what is left can be taken."""
+        self._assembler.finish(cut_off=cut_off)
 
     def take_cycles(self) -> list[Cycle]:
         """Finished cycles since the last call, in order."""

@@ -175,7 +175,7 @@ class _Copy:
             return "UNVERIFIABLE", ("the robot and rig files attached to the recording are lost",)
         for name, frames in self._merge.rest():
             self._decoder.feed(name, frames)
-        self._decoder.finish()
+        self._decoder.finish(cut_off=not finished)
         found = self._decoder.integrity.verdict()
         return found.text, found.because if finished else (*found.because, "the end of the run was not recorded")
 
