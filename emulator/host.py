@@ -5,6 +5,7 @@ to send and comes back with the frames that have arrived since. Whoever drives i
 wait on a real bus, or one step of simulated time.
 """
 
+import contextlib
 import struct
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass
@@ -309,6 +310,8 @@ class Host:
                     burst[axis.bus].append(self._control(axis))
                 yield from self._cycle(burst)
         yield from self._cycle(self._broadcast(nmt.Command.ENTER_PRE_OPERATIONAL), sync=False)
+        with contextlib.suppress(PeerError):  # a drive that no longer answers is off, or told already
+            yield from self._write([(0x1016, 1, bytes(4))] * len(self._axes))  # nobody is to miss us
 
     def _control(self, axis: _Axis) -> Frame:
         return Frame(nmt.rpdo_id(1, axis.node), _CONTROL.pack(axis.controlword, self._mode))
