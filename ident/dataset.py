@@ -4,6 +4,7 @@ Janot, Vandanjon & Gautier 2014, II.C. Nothing is interpolated over a gap: a gap
 """
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,6 +25,19 @@ STENCIL = 2  # samples either side of the five-point differences
 
 
 @dataclass(frozen=True)
+class Command:
+    """What the arm was told to do, on the rows of the signals.
+
+    Attributes:
+        reference: Target position active from the instant of the row on, shape (T, J) [rad]; NaN before the first.
+        by_drives: The drives controlled position themselves (CSP); else the host controlled torque (CST).
+    """
+
+    reference: Array
+    by_drives: bool = False
+
+
+@dataclass(frozen=True)
 class Signals:
     """What was measured, SI, joint side, on the time grid of SYNC.
 
@@ -37,6 +51,8 @@ class Signals:
         notes: What the reader of the recording should know (saturation, ...).
         verdict: `LOSSLESS`, `GAPS(n)` or `UNVERIFIABLE`, as the recorder closed the file.
         sha256: Of the file; empty where there is none.
+        command: Gives the reference that the arm was told to follow; None where it is not known. Called by methods that
+            simulate only.
     """
 
     source: str
@@ -48,6 +64,7 @@ class Signals:
     notes: list[str] = field(default_factory=list)
     verdict: str = "UNVERIFIABLE"
     sha256: str = ""
+    command: "Callable[[], Command] | None" = None
 
     def __post_init__(self) -> None:
         shape = (self.t_s.size, len(self.joints))

@@ -1,10 +1,12 @@
 """A recording as identification wants it: joint positions and torques of the cycles in which every drive was heard."""
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ident.dataset import Signals
+from ident.dataset import Command, Signals
 from protocols.errors import DataError
 from protocols.recording import Recording
+from protocols.targets import read_targets
 
 SATURATED = 0.99  # share of the largest current from which on the current loop may not follow
 
@@ -31,7 +33,18 @@ def signals(recording: Recording) -> Signals:
         notes=_saturation(recording),
         verdict=recording.verdict,
         sha256=recording.sha256,
+        command=lambda: command(recording, whole),
     )
+
+
+def command(recording: Recording, rows: NDArray[np.bool_]) -> Command:
+    """What the host asked for, on some rows.
+
+    Raises:
+        DataError: As `read_targets`.
+    """
+    targets = read_targets(recording)
+    return Command(recording.robot.joint_position(targets.position_counts[rows]), targets.by_position)
 
 
 def _saturation(recording: Recording) -> list[str]:

@@ -61,6 +61,7 @@ class Recording:
         metadata: Records by name.
         cell: None if nothing of a cell is recorded.
         events: In order of the file.
+        contents: The scanned file, for what is read when asked for (`protocols.targets`).
     """
 
     source: str
@@ -79,6 +80,7 @@ class Recording:
     metadata: Mapping[str, Mapping[str, str]]
     cell: CellSignals | None
     events: tuple[Event, ...]
+    contents: Contents
 
     def current_A(self) -> Floats:
         """Drive currents, shape (T, J) [A]; NaN where not known.
@@ -158,6 +160,7 @@ def read_recording(source: Path | bytes, robot: Robot | None = None, name: str |
         metadata=contents.metadata,
         cell=cell,
         events=events,
+        contents=contents,
     )
 
 
