@@ -150,3 +150,22 @@ def test_export_of_a_damaged_file_leaves_nothing_behind(small, tmp_path):
         assert not (tmp_path / f"out.{suffix}").exists()
     with pytest.raises(ConfigError, match=r"the name must end in .csv, .npz, .parquet or .log"):
         export(tmp_path / "cut.mcap", tmp_path / "out.xlsx")
+
+
+def test_recover_survives_any_damage(wire, record, tmp_path):
+    """Several bytes changed anywhere: what comes out is readable, or the refusal is a sentence."""
+    whole = record(wire.cycles(400)).path.read_bytes()
+    rng = np.random.default_rng(7)
+    refused = 0
+    for _ in range(40):
+        data = bytearray(whole)
+        for at in rng.integers(8, len(data), 6):
+            data[at] = int(rng.integers(256))
+        (tmp_path / "broken.mcap").write_bytes(data)
+        try:
+            found = recover(tmp_path / "broken.mcap", tmp_path / "fixed.mcap")
+            read_recording(found.path)
+        except DataError as error:
+            assert str(error).endswith((".", ".mcap."))
+            refused += 1
+    assert refused < 15  # only where a schema, the robot file or every cycle was hit
