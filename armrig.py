@@ -263,6 +263,16 @@ def move(
 
 
 @app.command()
+def check(rig: RigFile, bus: BusOption = None) -> None:
+    """Check a rig file and its robot, and print the rig with every default; bus loads go to stderr."""
+    from protocols import config
+
+    cell, _ = load(rig, bus)
+    report_loads(cell)
+    print(config.to_toml(cell), end="")
+
+
+@app.command()
 def hub(rig: RigFile) -> None:
     """Serve the virtualcan buses of a rig by themselves; `armrig emulate` does so by default."""
     from emulator.hub import serve as serve_hub
