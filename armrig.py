@@ -538,6 +538,14 @@ def serve(
         stop.wait()
 
 
+@app.command()
+def schema() -> None:
+    """JSON Schema of every message that the service and the log server exchange."""
+    from protocols.messages import json_schema
+
+    sys.stdout.write(msgspec.json.format(msgspec.json.encode(json_schema()), indent=2).decode() + "\n")
+
+
 request_app = typer.Typer(no_args_is_help=True, help="Ask a service.")
 app.add_typer(request_app, name="request")
 
