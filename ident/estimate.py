@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ident.base import Base
 from ident.contract import Iterate, Statistic
-from ident.covariance import hac
+from ident.covariance import HAC, Covariance, Moments
 from ident.observation import Observation, relative_error
 from ident.system import System, triangle
 from protocols.errors import IdentificationError
@@ -101,9 +101,11 @@ class LeastSquares:
 
     Attributes:
         weighted: Every joint by the standard deviation of its own sub-system, eq. (5)-(6).
+        covariance: How the standard deviations are made.
     """
 
     weighted: bool
+    covariance: Covariance = HAC
 
     @property
     def name(self) -> str:
@@ -118,13 +120,15 @@ class LeastSquares:
         return _least_squares(problem.observations, problem.base, problem.triangles, self)
 
 
-def estimate(observations: Sequence[Observation], base: Base, method: str = "wls") -> Estimate:
+def estimate(
+    observations: Sequence[Observation], base: Base, method: str = "wls", covariance: Covariance = HAC
+) -> Estimate:
     """IDIM-WLS (`wls`) or IDIM-OLS (`ols`) of observations alone.
 
     Raises:
         IdentificationError: The motion does not show some base parameters; names them.
     """
-    return _least_squares(observations, base, joint_triangles(observations), LeastSquares(method == "wls"))
+    return _least_squares(observations, base, joint_triangles(observations), LeastSquares(method == "wls", covariance))
 
 
 def joint_triangles(observations: Sequence[Observation]) -> list[Array]:
@@ -152,15 +156,16 @@ def _least_squares(
     used = sigma if method.weighted else np.full(joints, _residual_norm(whole, b) / np.sqrt(freedom))
     system = System.of_triangle(triangle([t / s for t, s in zip(triangles, used, strict=True)]))
     solution = system.solve()
-    covariance, lags = hac(observations, solution.beta, used, solution.inverse)
+    moments = Moments.weighted(observations, solution.beta, used, solution.inverse @ solution.inverse.T)
+    covariance, words = method.covariance.of(moments)
     return assemble(
         observations,
         base,
         method.name,
         solution.beta,
         covariance=covariance,
-        covariance_name=f"HAC (Newey-West, Bartlett kernel, {lags} lags), joints at one instant may correlate",
-        white=solution.inverse @ solution.inverse.T,
+        covariance_name=words,
+        white=moments.white,
         sigma_Nm=sigma,
         system=system,
         triangles=triangles,
@@ -214,7 +219,7 @@ def assemble(
         lag1=lag1,
         notes=[
             *(n for o in observations for n in o.notes),
-            *_autocorrelation_note(observations[0].joints, lag1),
+            *_autocorrelation_note(observations[0].joints, lag1, covariance_name),
             *notes,
         ],
         iterations=iterations,
@@ -292,6 +297,7 @@ def _lag1(observations: Sequence[Observation], residuals: Sequence[Array], joint
     return product / square if square > 0 else float("nan")
 
 
-def _autocorrelation_note(joints: list[str], lag1: Array) -> list[str]:
+def _autocorrelation_note(joints: list[str], lag1: Array, covariance: str) -> list[str]:
     values = ", ".join(f"{name} {value:+.2f}" for name, value in zip(joints, lag1, strict=True))
-    return [f"Residual autocorrelation at lag 1: {values}. The standard deviations allow for it, eq. (8) does not."]
+    allowed = "assume that there is none" if covariance.startswith("white") else "allow for it, eq. (8) does not"
+    return [f"Residual autocorrelation at lag 1: {values}. The standard deviations {allowed}."]
