@@ -16,10 +16,10 @@ from emulator.hub import Hub
 from emulator.machine import load_machine
 from emulator.rig import EmulatedRig
 from emulator.shell import emulate
-from protocols.cia402 import supported_modes
 from protocols.clock import RealClock
 from protocols.dictionary import drive_dictionary
 from protocols.eds import eds
+from protocols.objects import key
 from protocols.rig import load_rig
 
 SOURCE = Path(__file__).parent / "gocanopen"
@@ -75,7 +75,8 @@ def without_reals(text: str) -> str:
 def test_a_foreign_master_finds_configures_and_enables_a_drive(master: Path, channel: str, tmp_path: Path) -> None:
     _, robot = load_rig("tx40-rig")
     sheet = tmp_path / "drive.eds"
-    sheet.write_text(without_reals(eds(drive_dictionary(robot.joint[NODE - 1].drive), sheet.name)))
+    dictionary = drive_dictionary(robot.joint[NODE - 1].drive)
+    sheet.write_text(without_reals(eds(dictionary, sheet.name)))
     done = subprocess.run(
         [str(master), channel, str(NODE), str(sheet)], check=False, capture_output=True, text=True, timeout=120
     )
@@ -88,7 +89,7 @@ def test_a_foreign_master_finds_configures_and_enables_a_drive(master: Path, cha
     assert seen["read PDO"] == "182 type 1 6064:0/32 6078:0/16 2001:0/16"
     assert seen["configure PDO"] == "382 type 2, 2 objects"
     assert seen["PDOs on SYNC"] == "20 SYNCs: TPDO1 20, TPDO3 5 then 0"
-    assert seen["data sheet"].endswith(f"supported modes {supported_modes():08X}")
+    assert seen["data sheet"].endswith(f"supported modes {dictionary.defaults(NODE)[key(0x6502)]:08X}")
     assert seen["CiA 402"] == "0240 0231 0233 0237 0233 0231 0240"
     assert seen["reset"] == "one boot-up, defaults restored"
     assert seen["stopped"].startswith("silence, then statusword 02")
