@@ -1,74 +1,86 @@
 """Load of the CAN hub: two buses of three clients, 14 000 frames/s, each client and the hub a process of its own.
 
-Run: python tests/benchmarks/hub_load.py [seconds]
+Run: python tests/benchmarks/hub_load.py [SECONDS]
 """
 
+import json
 import multiprocessing as mp
 import resource
 import sys
 import time
+from multiprocessing.connection import Connection
 
 from emulator import hub
 from emulator.virtualcan import VirtualCanBus
 from protocols.frames import Frame
 
 PERIOD_NS = 1_000_000
-HOST_BURST = 4  # three RPDO2 and the SYNC
-DRIVE_BURST = 3  # three TPDO1
+TARGETS = [0x301, 0x302, 0x303]
+FEEDBACK = [0x181, 0x182, 0x183]
+SYNC = 0x080
+PATIENCE_S = 5.0
 
 
 def cpu_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_SELF); print(used.ru_utime, used.ru_stime)
+    used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 
 
-def serve(pipe) -> None:
+def numbered(ids: list[int], n: int) -> list[Frame]:
+    return [Frame(can_id, n.to_bytes(8, "big")) for can_id in ids]
+
+
+def serve(pipe: Connection) -> None:
     imported_s = cpu_s()
     hub.serve([("can0", "127.0.0.1:0"), ("can1", "127.0.0.1:0")], pipe.send)
     pipe.send(cpu_s() - imported_s)
 
 
-def host(channel: str, cycles: int, pipe) -> None:
-    bus = VirtualCanBus(channel)
-    answers, start = 0, time.monotonic_ns()
-    for n in range(cycles):
-        wait = start + n * PERIOD_NS - time.monotonic_ns()
-        if wait > 0:
-            time.sleep(wait * 1e-9)
-        bus.write_frames([Frame(0x300 + k, n.to_bytes(8, "big")) for k in range(3)] + [Frame(0x80, bytes([n % 240]))])
-        answers += len(bus.read_frames(0))
-    while answers < cycles * DRIVE_BURST and (frames := bus.read_frames(2)):
-        answers += len(frames)
-    pipe.send(("host", answers, "answers in", round((time.monotonic_ns() - start) * 1e-9, 3), "s"))
-    bus.shutdown()
+def host(channel: str, cycles: int, pipe: Connection) -> None:
+    """Targets and SYNC every period, whatever comes back."""
+    with VirtualCanBus(channel) as bus:
+        answers, start = 0, time.monotonic_ns()
+        for n in range(cycles):
+            wait = start + n * PERIOD_NS - time.monotonic_ns()
+            if wait > 0:
+                time.sleep(wait * 1e-9)
+            bus.write_frames([*numbered(TARGETS, n), Frame(SYNC, bytes([n % 240 + 1]))])
+            answers += len(bus.read_frames(0))
+        seconds = (time.monotonic_ns() - start) * 1e-9
+        while answers < cycles * len(FEEDBACK) and (frames := bus.read_frames(PATIENCE_S)):
+            answers += len(frames)
+    pipe.send({"who": "host", "frames": answers, "seconds": round(seconds, 2)})
 
 
-def drives(channel: str, cycles: int, pipe) -> None:
-    bus = VirtualCanBus(channel)
-    pipe.send("joined")
-    cycle = 0
-    while cycle < cycles:
-        for frame in bus.read_frames(5):
-            if frame.can_id == 0x80:
-                bus.write_frames([Frame(0x180 + k, cycle.to_bytes(8, "big")) for k in range(DRIVE_BURST)])
-                cycle += 1
-    pipe.send(("drives", cycle))
-    bus.shutdown()
+def drives(channel: str, cycles: int, pipe: Connection) -> None:
+    """Feedback on every SYNC."""
+    with VirtualCanBus(channel) as bus:
+        pipe.send("joined")
+        n = heard = 0
+        while n < cycles and (frames := bus.read_frames(PATIENCE_S)):
+            heard += len(frames)
+            for frame in frames:
+                if frame.can_id == SYNC:
+                    bus.write_frames(numbered(FEEDBACK, n))
+                    n += 1
+    pipe.send({"who": "drives", "frames": heard})
 
 
-def listener(channel: str, cycles: int, pipe) -> None:
-    bus = VirtualCanBus(channel)
-    pipe.send("joined")
-    count, out_of_order, last = 0, 0, {}
-    while count < cycles * (HOST_BURST + DRIVE_BURST) and (frames := bus.read_frames(5)):
-        count += len(frames)
-        for frame in frames:
-            if len(frame.data) == 8:
-                n = int.from_bytes(frame.data, "big")
-                out_of_order += n != last.get(frame.can_id, -1) + 1
-                last[frame.can_id] = n
-    pipe.send(("listener", count, "frames,", out_of_order, "out of order"))
-    bus.shutdown()
+def listener(channel: str, cycles: int, pipe: Connection) -> None:
+    """Everything, checked for order."""
+    count, out_of_order = 0, 0
+    following = dict.fromkeys([*TARGETS, *FEEDBACK], 0)
+    with VirtualCanBus(channel) as bus:
+        pipe.send("joined")
+        expected = cycles * (len(TARGETS) + 1 + len(FEEDBACK))
+        while count < expected and (frames := bus.read_frames(PATIENCE_S)):
+            count += len(frames)
+            for frame in frames:
+                if frame.can_id != SYNC:
+                    n = int.from_bytes(frame.data, "big")
+                    out_of_order += n != following[frame.can_id]
+                    following[frame.can_id] = n + 1
+    pipe.send({"who": "listener", "frames": count, "out_of_order": out_of_order})
 
 
 def main() -> None:
@@ -87,14 +99,12 @@ def main() -> None:
             if role is not host:
                 here.recv()
             started.append((process, here))
-    for _, pipe in reversed(started):
-        print(*pipe.recv())
-    for process, _ in started:
+    for process, pipe in started:
+        print(json.dumps(pipe.recv()))
         process.join()
     server.terminate()
-    used_s = ours.recv()
+    print(json.dumps({"who": "hub", "percent_of_a_core": round(100 * ours.recv() / seconds, 1)}))
     server.join()
-    print(f"hub: {100 * used_s / seconds:.1f} % of one core")
 
 
 if __name__ == "__main__":
