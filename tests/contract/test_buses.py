@@ -31,10 +31,10 @@ KINDS = [
 
 @dataclass
 class Wire:
-    """A bus under test, what joins it, and how to take it away."""
+    """A bus under test, who serves it, and who has joined."""
 
     config: Bus
-    hub: Hub | None
+    served: contextlib.ExitStack | None
     joined: contextlib.ExitStack
 
     def device(self) -> FrameBus:
@@ -48,19 +48,19 @@ class Wire:
 
 @pytest.fixture(params=KINDS)
 def wire(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Wire]:
-    with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as served, contextlib.ExitStack() as joined:
         if request.param == "python-can virtual":
-            yield Wire(Bus(name="can0", interface="virtual", channel=request.node.name), None, stack)
+            yield Wire(Bus(name="can0", interface="virtual", channel=request.node.name), None, joined)
         elif request.param == "socketcan":
-            yield Wire(Bus(name="can0", interface="socketcan", channel="vcan0"), None, stack)
+            yield Wire(Bus(name="can0", interface="socketcan", channel="vcan0"), None, joined)
         else:
             channel = "127.0.0.1:0" if request.param == "hub over tcp" else f"unix:{tmp_path}/can0"
-            hub = stack.enter_context(Hub([("can0", channel)]))
+            hub = served.enter_context(Hub([("can0", channel)]))
             thread = threading.Thread(target=hub.run)
             thread.start()
-            stack.callback(thread.join)
-            stack.callback(hub.stop)
-            yield Wire(Bus(name="can0", channel=hub.channels["can0"]), hub, stack)
+            served.callback(thread.join)
+            served.callback(hub.stop)
+            yield Wire(Bus(name="can0", channel=hub.channels["can0"]), served, joined)
 
 
 def hear(bus: FrameBus | Listener, timeout_s: float) -> list[Frame]:
@@ -185,7 +185,7 @@ def test_leaving_disturbs_nobody(wire: Wire) -> None:
 
 
 def test_a_bus_that_goes_away_while_one_waits_is_an_error_with_its_name(wire: Wire) -> None:
-    if wire.hub is None:
+    if wire.served is None:
         pytest.skip("no hub to stop: the wire is this process' or the kernel's")
     bus = wire.device()
     together(wire, bus)
@@ -199,8 +199,7 @@ def test_a_bus_that_goes_away_while_one_waits_is_an_error_with_its_name(wire: Wi
 
     reader = threading.Thread(target=read)
     reader.start()
-    wire.hub.stop()
-    wire.joined.close()
+    wire.served.close()
     reader.join()
     assert "bus can0" in str(outcome[0])
     assert "is gone" in str(outcome[0])
