@@ -81,12 +81,12 @@ class Iterate(msgspec.Struct, frozen=True):
     Attributes:
         beta: Base parameters, in the order of the result.
         position_error_percent: ||q - qs|| / ||q|| of the simulation at them, per joint (Janot et al. 2014, Table 5).
-        residual_norm: Weighted, of eq. (27) or of the output error.
+        residual_norm: Of eq. (27) or of the output error; None at a start where it was not computed.
     """
 
     beta: list[float]
     position_error_percent: list[float]
-    residual_norm: float
+    residual_norm: float | None
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):

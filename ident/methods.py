@@ -4,9 +4,11 @@
 from collections.abc import Mapping
 
 from ident.estimate import LeastSquares
+from ident.iv import IdimIv
 from ident.problem import Estimator
 
 METHODS: Mapping[str, Estimator] = {
     "ols": LeastSquares(weighted=False),
     "wls": LeastSquares(weighted=True),
+    "iv": IdimIv(),
 }

@@ -55,12 +55,17 @@ class System:
         """Instrumental variables on the triangle of QR([Z W y])."""
         return cls(R[:, b : 2 * b], R[:, 2 * b], R[:, :b])
 
+    @property
+    def instruments(self) -> Array:
+        """Z, or W for least squares."""
+        return self.W if self.Z is None else self.Z
+
     def solve(self, kept: NDArray[np.bool_] | None = None) -> Solution:
         """Solution with some parameters only, the others zero; covariance by eq. (8), for instruments inv(Z'Z)."""
         b = self.W.shape[1]
         kept = np.ones(b, dtype=bool) if kept is None else kept
         W = self.W[:, kept]
-        Q, R = linalg.qr(W if self.Z is None else self.Z[:, kept], mode="economic", check_finite=False)
+        Q, R = linalg.qr(self.instruments[:, kept], mode="economic", check_finite=False)
         beta, inverse = np.zeros(b), np.zeros((b, b))
         # R'Q'W beta = R'Q'y; for least squares Q'W = R
         beta[kept] = linalg.solve_triangular(R, Q.T @ self.y) if self.Z is None else linalg.solve(Q.T @ W, Q.T @ self.y)
