@@ -6,6 +6,7 @@ u32be length (14) | u32be identifier with the SocketCAN flag bits | u8 flags | u
 
 import struct
 from collections.abc import Iterable, Iterator
+from functools import lru_cache
 
 import msgspec
 
@@ -14,6 +15,7 @@ REMOTE = 0x4000_0000  # CAN_RTR_FLAG
 ERROR = 0x2000_0000  # CAN_ERR_FLAG: the frame reports an error seen by the controller
 ID_MASK = 0x1FFF_FFFF
 MAX_DATA = 8
+INTERMISSION_BITS = 3  # between two frames
 
 _WIRE = struct.Struct(">IIBB8s")
 WIRE_BYTES = _WIRE.size
@@ -60,38 +62,75 @@ def decode(buffer: bytes | bytearray | memoryview) -> Iterator[Frame]:
 # --- length on the wire ---
 
 _CRC15 = 0x4599
-_TAIL_BITS = 1 + 1 + 1 + 7 + 3  # CRC delimiter, ACK slot, ACK delimiter, EOF, interframe space: never stuffed
+_TAIL_BITS = 1 + 1 + 1 + 7 + INTERMISSION_BITS  # CRC delimiter, ACK slot, ACK delimiter, EOF: never stuffed
 
 
-def _stuffable_bits(frame: Frame) -> list[int]:
-    """Start of frame to the end of the CRC (ISO 11898-1), before stuffing."""
-    rtr = 1 if frame.can_id & REMOTE else 0
-    ident = frame.can_id & ID_MASK
-    dlc = frame.dlc or len(frame.data)
-    if frame.can_id & EXTENDED:
+def _crc(crc: int, value: int, count: int) -> int:
+    """CRC after `count` more bits, the highest of `value` first."""
+    for k in range(count - 1, -1, -1):
+        top = crc >> 14 ^ value >> k & 1
+        crc = crc << 1 & 0x7FFF ^ (_CRC15 if top else 0)
+    return crc
+
+
+def _stuff(state: int, value: int, count: int) -> int:
+    """Stuffing state after `count` more bits.
+
+    Args:
+        state: 16 x stuff bits so far + 8 x last bit + length of its run (0 before the first bit).
+    """
+    stuffed, last, run = state >> 4, state >> 3 & 1, state & 7
+    for k in range(count - 1, -1, -1):
+        bit = value >> k & 1
+        run = run + 1 if bit == last else 1
+        last = bit
+        if run == 5:  # a complementary bit follows and starts a run of its own
+            stuffed, last, run = stuffed + 1, 1 - bit, 1
+    return stuffed << 4 | last << 3 | run
+
+
+# A frame's length is wanted a dozen thousand times a second: bytes go through tables, headers are remembered.
+_CRC_BYTE = [_crc(byte << 7, 0, 8) for byte in range(256)]
+_STUFF_BYTE = [[_stuff(state, byte, 8) for byte in range(256)] for state in range(16)]
+_STUFF_7 = [[_stuff(state, value, 7) for value in range(128)] for state in range(16)]
+
+
+@lru_cache(maxsize=4096)
+def _header(can_id: int, dlc: int) -> tuple[int, int, int]:
+    """Start of frame to the DLC (ISO 11898-1): bits, CRC and stuffing state."""
+    rtr = 1 if can_id & REMOTE else 0
+    ident = can_id & ID_MASK
+    if can_id & EXTENDED:
         text = f"0{ident >> 18:011b}11{ident & 0x3FFFF:018b}{rtr}00{dlc:04b}"
     else:
         text = f"0{ident:011b}{rtr}00{dlc:04b}"
-    bits = [int(c) for c in text] + [(byte >> k) & 1 for byte in frame.data for k in range(7, -1, -1)]
-    crc = 0
-    for bit in bits:
-        top = bit ^ (crc >> 14 & 1)
-        crc = (crc << 1) & 0x7FFF
-        if top:
-            crc ^= _CRC15
-    return bits + [(crc >> k) & 1 for k in range(14, -1, -1)]
+    value, count = int(text, 2), len(text)
+    return count, _crc(0, value, count), _stuff(0, value, count)
 
 
 def bit_length(frame: Frame) -> int:
     """Bits the frame occupies on the bus, with its own stuff bits and the interframe space (ISO 11898-1)."""
-    bits = _stuffable_bits(frame)
-    length, run, last = len(bits), 0, -1
-    for bit in bits:
-        run = run + 1 if bit == last else 1
-        last = bit
-        if run == 5:  # a complementary bit follows and starts a run of its own
-            length, run, last = length + 1, 1, 1 - bit
-    return length + _TAIL_BITS
+    data = frame.data
+    count, crc, state = _header(frame.can_id, frame.dlc or len(data))
+    stuffed = 0
+    for byte in data:
+        crc = (crc << 8 & 0x7FFF) ^ _CRC_BYTE[crc >> 7 ^ byte]
+        stuffed += state >> 4
+        state = _STUFF_BYTE[state & 15][byte]
+    stuffed += state >> 4
+    state = _STUFF_BYTE[state & 15][crc >> 7]
+    stuffed += state >> 4
+    state = _STUFF_7[state & 15][crc & 127]
+    return count + 8 * len(data) + 15 + stuffed + (state >> 4) + _TAIL_BITS
+
+
+def priority(can_id: int) -> int:
+    """Rank in arbitration, the lowest wins: identifier, RTR and IDE bits in the order they are sent (ISO 11898-1)."""
+    remote = 1 if can_id & REMOTE else 0
+    ident = can_id & ID_MASK
+    if can_id & EXTENDED:  # SRR and IDE are recessive
+        return (ident >> 18) << 21 | 3 << 19 | (ident & 0x3FFFF) << 1 | remote
+    return ident << 21 | remote << 20
 
 
 def worst_case_bits(data_bytes: int, *, extended: bool = False) -> int:

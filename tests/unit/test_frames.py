@@ -61,3 +61,47 @@ def test_bus_arithmetic_of_six_drives_at_1_khz() -> None:
     tpdo = [(8, 1000.0)] * 6 + [(1, 1000.0)]
     assert frames.bus_load(tpdo, 1_000_000) == pytest.approx(0.875)
     assert frames.bus_load(tpdo + [(8, 1000.0)] * 6, 1_000_000) == pytest.approx(1.685)
+
+
+def longhand(frame: Frame) -> int:
+    """Length of a frame as a person would write it: every bit, the CRC by long division, then stuffing."""
+    dlc, ident, rtr = frame.dlc or len(frame.data), frame.can_id & frames.ID_MASK, int(bool(frame.can_id & REMOTE))
+    if frame.can_id & EXTENDED:
+        text = f"0{ident:029b}"[:12] + "11" + f"{ident:029b}"[11:] + f"{rtr}00{dlc:04b}"
+    else:
+        text = f"0{ident:011b}{rtr}00{dlc:04b}"
+    text += "".join(f"{byte:08b}" for byte in frame.data)
+    rest = int(text + "0" * 15, 2)
+    divisor = 0b1100010110011001  # x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1
+    for shift in range(len(text) - 1, -1, -1):
+        if rest >> (shift + 15) & 1:
+            rest ^= divisor << shift
+    sent = ""
+    for bit in f"{text}{rest:015b}":
+        sent += bit
+        if sent[-5:] in {"00000", "11111"}:
+            sent += "1" if bit == "0" else "0"
+    return len(sent) + 13  # CRC delimiter, ACK slot and delimiter, seven of EOF, three of intermission
+
+
+@given(any_frame)
+def test_length_is_that_of_the_bits_written_out(frame: Frame) -> None:
+    assert frames.bit_length(frame) == longhand(frame)
+
+
+def test_all_zero_feedback_is_as_long_as_was_measured() -> None:
+    assert frames.bit_length(Frame(0x181, bytes(8))) == 126  # by an encoder of its own
+
+
+@given(any_frame, any_frame)
+def test_priority_is_the_order_of_the_bits_sent(one: Frame, other: Frame) -> None:
+    """Dominant is 0: of two frames, the one with the first 0 where they differ wins."""
+
+    def arbitration(frame: Frame) -> str:
+        ident, rtr = frame.can_id & frames.ID_MASK, "1" if frame.can_id & REMOTE else "0"
+        if frame.can_id & EXTENDED:
+            return f"{ident >> 18:011b}11{ident & 0x3FFFF:018b}{rtr}"
+        return f"{ident:011b}{rtr}0"
+
+    first, second = sorted((one, other), key=lambda f: frames.priority(f.can_id))
+    assert arbitration(first).ljust(32, "0") <= arbitration(second).ljust(32, "0")
