@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from emulator.bus import open_bus, receive_any
+from emulator.bus import open_bus
 from emulator.hub import Hub
 from emulator.machine import load_machine
 from emulator.rig import EmulatedRig
@@ -19,13 +19,11 @@ from emulator.shell import emulate
 from protocols.clock import RealClock
 from protocols.dictionary import drive_dictionary
 from protocols.eds import eds
-from protocols.frames import Frame
 from protocols.objects import key
-from protocols.rig import Bus, load_rig
+from protocols.rig import load_rig
 
 SOURCE = Path(__file__).parent / "gocanopen"
 NODE = 2
-READY_S = 120
 
 pytestmark = [
     pytest.mark.stranger,
@@ -45,22 +43,15 @@ def master(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return program
 
 
-def wait_for_drive(bus: Bus) -> None:
-    """Return when the drive answers SDO: the first step of a rig compiles its kernels, longer than a scan waits."""
-    clock = RealClock()
-    with open_bus(bus) as probe:
-        while clock.now_ns() < READY_S * 1e9:
-            probe.send([Frame(0x600 + NODE, bytes.fromhex("4000100000000000"))])  # upload 0x1000
-            if any(frame.can_id == 0x580 + NODE for frame in receive_any([probe], 0.5)[0]):
-                return
-    raise TimeoutError(f"drive {NODE} has not answered for {READY_S} s")
-
-
 @pytest.fixture
 def channel() -> Iterator[str]:
     """The TX40 rig in real time on hub buses of its own; the channel of `can0`, where nodes 1 to 3 are."""
     rig, robot = load_rig("tx40-rig")
-    arm = EmulatedRig(rig, load_machine(rig, robot))
+    machine = load_machine(rig, robot)
+    rehearsal = EmulatedRig(rig, machine)  # compiles the kernels, which takes longer than a scan waits
+    rehearsal.start(0)
+    rehearsal.step(1_000_000_000, [[] for _ in rig.bus])
+    arm = EmulatedRig(rig, machine)
     stop = threading.Event()
     with contextlib.ExitStack() as stack:
         hub = stack.enter_context(Hub([(b.name, "127.0.0.1:0") for b in rig.bus]))
@@ -74,7 +65,6 @@ def channel() -> Iterator[str]:
         running.start()
         stack.callback(running.join)
         stack.callback(stop.set)
-        wait_for_drive(opened[0])
         yield opened[0].channel
 
 
