@@ -201,15 +201,24 @@ def _check_times(signals: Signals, steps: Array, period: float) -> None:
 
 
 def _segment(signals: Signals, rows: slice, period: float, filter_Hz: float, settle: int) -> Segment:
-    q = signals.q[rows]
-    if np.isfinite(filter_Hz):
-        sos = signal.butter(FILTER_ORDER, filter_Hz, fs=1 / period, output="sos")
-        # channel by channel: half the memory of all at once
-        q = np.column_stack([signal.sosfiltfilt(sos, channel) for channel in q.T])
+    q = lowpass(signals.q[rows], period, filter_Hz)
     tau = _aligned(signals.tau_Nm[rows], signals.delay_s / period)
     qd, qdd = differences(q, period)
     inner = slice(settle + STENCIL, len(tau) - settle - STENCIL)
     return Segment(signals.t_s[rows][inner], q[inner], qd[inner], qdd[inner], tau[inner])
+
+
+def lowpass(q: Array, period: float, filter_Hz: float) -> Array:
+    """Butterworth filter forwards and backwards, channel by channel: half the memory of all at once.
+
+    Args:
+        q: shape (T, J).
+        filter_Hz: Cut-off; infinite for none.
+    """
+    if not np.isfinite(filter_Hz):
+        return q
+    sos = signal.butter(FILTER_ORDER, filter_Hz, fs=1 / period, output="sos")
+    return np.column_stack([signal.sosfiltfilt(sos, channel) for channel in q.T])
 
 
 def _aligned(tau: Array, delay: Array) -> Array:

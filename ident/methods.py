@@ -3,12 +3,22 @@
 
 from collections.abc import Mapping
 
+from ident.ekf import ExtendedKalman
 from ident.estimate import LeastSquares
+from ident.irls import IterativelyReweighted
 from ident.iv import IdimIv
+from ident.ml import MaximumLikelihood
 from ident.problem import Estimator
+from ident.setmembership import SetMembership
+from ident.tls import TotalLeastSquares
 
 METHODS: Mapping[str, Estimator] = {
     "ols": LeastSquares(weighted=False),
     "wls": LeastSquares(weighted=True),
     "iv": IdimIv(),
+    "irls": IterativelyReweighted(),
+    "tls": TotalLeastSquares(),
+    "ml": MaximumLikelihood(),
+    "ekf": ExtendedKalman(),
+    "setmembership": SetMembership(),
 }

@@ -24,13 +24,13 @@ def identified_robot(model: Model, base: Base, beta: Array) -> Robot:
         beta: Base parameters, shape (b,).
     """
     nominal = model.theta(model.robot)
-    scale = _scale(model)
+    scale = prior_sigma(model)
     BD = base.B * scale
     step = np.linalg.lstsq(BD @ BD.T, beta - base.B @ nominal, rcond=None)[0]
     return _with(model, nominal + scale * (BD.T @ step))
 
 
-def _scale(model: Model) -> Array:
+def prior_sigma(model: Model) -> Array:
     """1-sigma of each standard parameter; 1 where the robot file has none, shape (P,)."""
     known = [j if j.sigma is None else msgspec.structs.replace(j, parameters=j.sigma) for j in model.robot.joint]
     sigma = model.theta(msgspec.structs.replace(model.robot, joint=known))
