@@ -52,6 +52,8 @@ class Control:
             )
         if self.period_s == 0 and (self.delay or self.difference):
             raise ConfigError("A delay, or speed from positions, needs a sampled control law: give its period.")
+        if self.model is not None and not np.array_equal(self.axes, np.eye(J)):
+            raise ConfigError("Computed torque acts on joints: leave the axes of the law out.")
 
     @classmethod
     def gains(
