@@ -178,6 +178,18 @@ def _sense(power: Power, state: State, draw: Floats) -> None:
 
 
 @compiled
+def _trace(power: Power, state: State, draw: Floats, mean: Floats, position: Floats, current: Floats) -> None:
+    """What encoders (before rounding and noise) and current sensors read after one substep."""
+    J = len(mean)
+    for j in range(J):
+        angle = 0.0
+        for i in range(J):
+            angle += power.C[j, i] * state.q[i]
+        position[j] = angle * power.counts_per_rad[j]
+        current[j] = mean[j] + draw[j] * power.noise_A[j]
+
+
+@compiled
 def advance_period(
     body: Body,
     power: Power,
@@ -188,6 +200,7 @@ def advance_period(
     draws: Floats,
     ambient_C: float,
     h: float,
+    trace: Floats,
 ) -> bool:
     """All substeps of one period; False where the mass matrix is not positive definite.
 
@@ -195,6 +208,8 @@ def advance_period(
         target: Motor positions [counts].
         draws: Standard normal, one row per substep for the current sensors and one for the encoders.
         h: Substep [s].
+        trace: Filled with encoders [counts] and currents [A] after each substep, shape (substeps, 2, J); of length 0
+            where nobody wants to know.
     """
     substeps, J = len(draws) - 1, len(mode)
     K = len(body.dry_Nm)
@@ -231,6 +246,8 @@ def advance_period(
             qdd[j] = (speed[j] - qd[j]) / h
             qd[j] = speed[j]
             q[j] = middle[j] + h / 2 * qd[j]
+        if len(trace) > 0:
+            _trace(power, state, draws[step], mean, trace[step, 0], trace[step, 1])
     state.target[:] = target
     _sense(power, state, draws[substeps])
     return True

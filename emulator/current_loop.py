@@ -12,11 +12,6 @@ from emulator.kernels import Floats, compiled
 from protocols.robot import Drive
 
 
-def gains(drive: Drive) -> tuple[float, float]:
-    """KR [V/A] and TN [s] whose zero cancels the pole of the winding: first-order loop of the drive's bandwidth."""
-    return 2 * np.pi * drive.current_bandwidth_Hz * drive.inductance_H, drive.inductance_H / drive.resistance_Ohm
-
-
 def closed_loop(drive: Drive, kr: float, tn_s: float, h_s: float) -> Floats:
     """One substep of the loop within its voltage limit.
 

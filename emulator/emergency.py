@@ -51,6 +51,10 @@ class EmergencyProducer:
     def is_active(self, code: int) -> bool:
         return code in self._active
 
+    @property
+    def any_active(self) -> bool:
+        return bool(self._active)
+
     def occur(self, code: int, detail: bytes = b"") -> None:
         """An error is there. Repeating it while it lasts says nothing new.
 

@@ -46,7 +46,8 @@ class HeartbeatConsumer:
     """Watches nodes; each from its first heartbeat on.
 
     Args:
-        lost, found: Called with the node when it falls silent, and when it speaks again.
+        lost: Called with the node that falls silent.
+        found: Called when one speaks again.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class HeartbeatConsumer:
         store: ObjectStore,
         timers: Timers,
         lost: Callable[[int], None],
-        found: Callable[[int], None],
+        found: Callable[[], None],
     ) -> None:
         self._store = store
         self._timers = timers
@@ -87,7 +88,7 @@ class HeartbeatConsumer:
     def _recover(self, node: int) -> None:
         if node in self._silent:
             self._silent.discard(node)
-            self._found(node)
+            self._found()
 
     def _expire(self, node: int) -> None:
         self._silent.add(node)

@@ -8,13 +8,15 @@ from emulator.store import ObjectStore
 from emulator.timers import Timers
 from protocols import emcy, nmt
 from protocols.dictionary import INVALID, NO_RTR
-from protocols.frames import Frame
+from protocols.frames import REMOTE, Frame
 from protocols.objects import Entry, Value, key
 from protocols.pdo import (
     EVENT_TYPES,
     LAST_SYNCHRONOUS,
     MAPPING_OFFSET,
+    ON_REQUEST,
     RECEIVE,
+    SAMPLED_ON_SYNC,
     TRANSMIT,
     Layout,
     compile_mapping,
@@ -23,6 +25,7 @@ from protocols.sdo import Abort, SdoError
 
 Handler = Callable[[bytes], bool]
 
+_WINDOW = key(0x1007)
 _MOST = 512  # PDOs of each direction that a dictionary has room for
 
 
@@ -31,15 +34,19 @@ class _Receive:
 
     Attributes:
         plain: Its objects need no checks: values are stored as they come.
+        deadline_ns: A frame is due so long after the one before; 0: whenever it likes.
         pending: Data that waits for the next SYNC.
         short: The last frame had too few bytes.
+        late: The deadline has passed.
     """
 
-    __slots__ = ("layout", "number", "pending", "plain", "short", "synchronous")
+    __slots__ = ("deadline_ns", "late", "layout", "number", "pending", "plain", "short", "synchronous")
 
-    def __init__(self, number: int, layout: Layout, *, synchronous: bool, plain: bool) -> None:
+    def __init__(self, number: int, layout: Layout, deadline_ns: int, *, synchronous: bool, plain: bool) -> None:
         self.number = number
         self.layout = layout
+        self.deadline_ns = deadline_ns
+        self.late = False
         self.synchronous = synchronous
         self.plain = plain
         self.pending: bytes | None = None
@@ -50,19 +57,34 @@ class _Transmit:
     """One TPDO in use.
 
     Attributes:
+        start: SYNC counter that it waits for, once (0x1800:6); 0: any.
         countdown: SYNCs until it is due.
-        last: Data sent last; None before the first.
+        last: Data sent or sampled last; None before the first.
     """
 
-    __slots__ = ("cob_id", "countdown", "event_ns", "inhibit_ns", "kind", "last", "layout", "not_before_ns", "number")
+    __slots__ = (
+        "cob_id",
+        "countdown",
+        "event_ns",
+        "inhibit_ns",
+        "kind",
+        "last",
+        "layout",
+        "not_before_ns",
+        "number",
+        "start",
+    )
 
-    def __init__(self, number: int, layout: Layout, cob_id: int, kind: int, inhibit_ns: int, event_ns: int) -> None:
+    def __init__(
+        self, number: int, layout: Layout, cob_id: int, kind: int, inhibit_ns: int, event_ns: int, start: int
+    ) -> None:
         self.number = number
         self.layout = layout
         self.cob_id = cob_id
         self.kind = kind
         self.inhibit_ns = inhibit_ns
         self.event_ns = event_ns
+        self.start = start
         self.countdown = kind
         self.last: bytes | None = None
         self.not_before_ns = 0
@@ -91,10 +113,12 @@ class PdoEngine:
         self._send = send
         self._rerouted = rerouted
         self._running = False
+        self._sync_ns = 0
         self._receive: dict[int, _Receive] = {}
         self._transmit: dict[int, _Transmit] = {}
         self._synchronous_receive: list[_Receive] = []
-        self._synchronous_transmit: list[_Transmit] = []
+        self._every_sync: list[_Transmit] = []
+        self._some_syncs: list[_Transmit] = []
         self._on_event: list[_Transmit] = []
         objects = store.dictionary.objects
         self._present = [(base, n) for base in (RECEIVE, TRANSMIT) for n in range(_MOST) if base + n in objects]
@@ -117,30 +141,47 @@ class PdoEngine:
         self._running = False
         for pdo in self._transmit.values():
             self._cancel(pdo)
+        for waiting in self._receive.values():
+            self._timers.cancel(("deadline", waiting.number))
         self._receive.clear()
         self._transmit.clear()
         self._sort()
 
     def routes(self) -> dict[int, Handler]:
-        """Handlers of the RPDOs in use, by identifier. A handler tells whether anything took effect at once."""
-        return {self._cob_id(RECEIVE, n): partial(self._take, pdo) for n, pdo in self._receive.items()}
+        """Handlers of the RPDOs in use and of remote frames for TPDOs, by identifier. A handler tells whether anything
+        took effect at once."""
+        handlers: dict[int, Handler] = {}
+        for n, pdo in self._transmit.items():
+            if not self._store.values[key(TRANSMIT + n, 1)] & NO_RTR:
+                handlers[pdo.cob_id | REMOTE] = partial(self._requested, pdo)
+        for n, expected in self._receive.items():
+            handlers[self._cob_id(RECEIVE, n)] = partial(self._take, expected)
+        return handlers
 
     # --- frames ---
 
-    def activate(self) -> None:
+    def activate(self, t_ns: int) -> None:
         """SYNC: the synchronous RPDOs received since the last one take effect."""
+        self._sync_ns = t_ns
         for pdo in self._synchronous_receive:
             if pdo.pending is not None:
                 self._apply(pdo, pdo.pending)
                 pdo.pending = None
 
-    def transmit(self) -> None:
+    def transmit(self, counter: int | None) -> None:
         """SYNC: send the synchronous TPDOs that are due."""
         values = self._store.values
-        for pdo in self._synchronous_transmit:
-            if pdo.kind == 1:
-                self._send(Frame(pdo.cob_id, pdo.layout.pack(values)))
-            elif pdo.kind:
+        for pdo in self._every_sync:
+            self._send(Frame(pdo.cob_id, pdo.layout.pack(values)))
+        for pdo in self._some_syncs:
+            if pdo.kind == SAMPLED_ON_SYNC:
+                pdo.last = pdo.layout.pack(values)
+                continue
+            if pdo.start:
+                if counter is not None and counter != pdo.start:
+                    continue
+                pdo.start = 0
+            if pdo.kind:
                 pdo.countdown -= 1
                 if pdo.countdown == 0:
                     pdo.countdown = pdo.kind
@@ -169,6 +210,26 @@ class PdoEngine:
         if pdo.event_ns:
             self._timers.schedule(("event", pdo.number), now_ns + pdo.event_ns, partial(self._send_event, pdo))
 
+    def _requested(self, pdo: _Transmit, _: bytes) -> bool:
+        """A remote frame asks for a TPDO."""
+        if pdo.kind != SAMPLED_ON_SYNC:
+            self._send(Frame(pdo.cob_id, pdo.layout.pack(self._store.values)))
+        elif pdo.last is not None:
+            self._send(Frame(pdo.cob_id, pdo.last))
+        return False
+
+    def _miss(self, pdo: _Receive) -> None:
+        pdo.late = True
+        self._emergencies.occur(emcy.Code.RPDO_TIMEOUT, bytes((pdo.number,)))
+
+    def _expect(self, pdo: _Receive) -> None:
+        """The next frame of an RPDO with a deadline."""
+        self._timers.schedule(("deadline", pdo.number), self._timers.now_ns + pdo.deadline_ns, partial(self._miss, pdo))
+        if pdo.late:
+            pdo.late = False
+            if not any(p.late for p in self._receive.values()):
+                self._emergencies.vanish(emcy.Code.RPDO_TIMEOUT)
+
     def _take(self, pdo: _Receive, data: bytes) -> bool:
         if len(data) < pdo.layout.size:
             pdo.short = True
@@ -178,8 +239,12 @@ class PdoEngine:
             pdo.short = False
             if not any(p.short for p in self._receive.values()):
                 self._emergencies.vanish(emcy.Code.PDO_LENGTH)
+        if pdo.deadline_ns:
+            self._expect(pdo)
         if pdo.synchronous:
-            pdo.pending = data
+            window_us = self._store.values.get(_WINDOW)
+            if not window_us or self._timers.now_ns - self._sync_ns <= 1000 * window_us:
+                pdo.pending = data
             return False
         self._apply(pdo, data)
         return True
@@ -213,18 +278,20 @@ class PdoEngine:
         values, communication = self._store.values, key(base + n)
         if base == TRANSMIT and n in self._transmit:
             self._cancel(self._transmit.pop(n))
-        if base == RECEIVE:
-            self._receive.pop(n, None)
+        if base == RECEIVE and n in self._receive:
+            self._timers.cancel(("deadline", self._receive.pop(n).number))
         count = values[key(base + MAPPING_OFFSET + n)]
         if self._off(base, n) or count == 0:
             return
         layout, kind = self._layout(base, n, count), values[communication + 2]
         if base == RECEIVE:
             plain = not any(self._store.watched(e) for e in layout.entries)
-            self._receive[n] = _Receive(n + 1, layout, synchronous=kind <= LAST_SYNCHRONOUS, plain=plain)
+            deadline_ns = values[communication + 5] * 1_000_000
+            self._receive[n] = _Receive(n + 1, layout, deadline_ns, synchronous=kind <= LAST_SYNCHRONOUS, plain=plain)
         else:
             inhibit_ns, event_ns = values[communication + 3] * 100_000, values[communication + 5] * 1_000_000
-            self._transmit[n] = _Transmit(n + 1, layout, self._cob_id(base, n), kind, inhibit_ns, event_ns)
+            start = values[communication + 6]
+            self._transmit[n] = _Transmit(n + 1, layout, self._cob_id(base, n), kind, inhibit_ns, event_ns, start)
 
     def _changed(self, base: int, n: int) -> None:
         if self._running:
@@ -234,7 +301,9 @@ class PdoEngine:
 
     def _sort(self) -> None:
         self._synchronous_receive = [p for p in self._receive.values() if p.synchronous]
-        self._synchronous_transmit = [p for p in self._transmit.values() if p.kind <= LAST_SYNCHRONOUS]
+        on_sync = [p for p in self._transmit.values() if p.kind <= LAST_SYNCHRONOUS or p.kind == SAMPLED_ON_SYNC]
+        self._every_sync = [p for p in on_sync if p.kind == 1 and not p.start]
+        self._some_syncs = [p for p in on_sync if p.kind != 1 or p.start]
         self._on_event = [p for p in self._transmit.values() if p.kind in EVENT_TYPES]
 
     def _cancel(self, pdo: _Transmit) -> None:
@@ -245,9 +314,11 @@ class PdoEngine:
         number = int(value)
         if entry.sub == 1:
             self._check_cob_id(base, number, self._store.values[entry.key])
-        elif entry.sub == 2 and not (number <= LAST_SYNCHRONOUS or number in EVENT_TYPES):
-            raise SdoError(Abort.VALUE)
-        elif entry.sub == 3 and not self._off(base, n):  # CiA 301, 7.5.2.37: not while the PDO exists
+        elif entry.sub == 2:
+            on_request = base == TRANSMIT and number in {SAMPLED_ON_SYNC, ON_REQUEST}
+            if not (number <= LAST_SYNCHRONOUS or number in EVENT_TYPES or on_request):
+                raise SdoError(Abort.VALUE)
+        elif entry.sub in {3, 6} and not self._off(base, n):  # CiA 301, 7.5.2.37: not while the PDO exists
             raise SdoError(Abort.STATE)
 
     @staticmethod

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from emulator import current_loop
 from emulator.arm import Body, Power, State, advance_period
 from emulator.kernels import Floats, Ints
+from protocols.dictionary import current_loop_gains
 from protocols.errors import ConfigError
 from protocols.robot import Robot, geometry
 
@@ -51,10 +52,11 @@ class Plant:
         self._substeps = max(1, int(np.ceil(period_s * substep_Hz - 1e-9)))
         self._h_s = period_s / self._substeps
         self._rng = rng
+        self._trace_rng = rng.spawn(1)[0]
         self.ambient_C = ambient_C
         self._body = _body(robot)
         self._power = _power(robot, period_s, self._substeps, current_noise_A, encoder_noise_rad)
-        self.current_gains = np.array([current_loop.gains(joint.drive) for joint in robot.joint])
+        self.current_gains = np.array([current_loop_gains(joint.drive) for joint in robot.joint])
         for j in range(J):
             self.set_current_gains(j, *self.current_gains[j])
         low = np.array([joint.position_min_rad for joint in robot.joint])
@@ -76,6 +78,7 @@ class Plant:
         self.q, self.qd, self.motor_temperature_C = self._state.q, self._state.qd, self._state.temperature_C
         self._counts = np.rint(self._state.counts).astype(np.int64)
         self._before = self._counts
+        self.keep_trace(wanted=False)
 
     def set_current_gains(self, j: int, kr: float, tn_s: float) -> None:
         """PI gains of the current loop of axis j.
@@ -95,6 +98,10 @@ class Plant:
         self._power.kr[j] = kr
         self._power.integration[j] = kr * self._h_s / tn_s
         self._power.linear[j] = current_loop.closed_loop(self._robot.joint[j].drive, kr, tn_s, self._h_s)
+
+    def set_current_limit(self, j: int, limit_A: float) -> None:
+        """Saturation of the current loop's reference on axis j, in every mode."""
+        self._power.max_A[j] = limit_A
 
     def advance(self, mode: Ints, target_counts: Floats, target_current_A: Floats) -> None:
         """One sync period.
@@ -118,6 +125,7 @@ class Plant:
             draws,
             self.ambient_C,
             self._h_s,
+            self._trace,
         ):
             raise ConfigError(
                 f"{self._robot.name}: the mass matrix is not positive definite at"
@@ -125,6 +133,21 @@ class Plant:
             )
         self._before = self._counts
         self._counts = np.rint(self._state.counts).astype(np.int64)
+
+    @property
+    def substep_s(self) -> float:
+        """Spacing of `trace`."""
+        return self._h_s
+
+    def keep_trace(self, *, wanted: bool) -> None:
+        """Have `advance` remember its substeps; nothing else depends on it."""
+        self._trace = np.empty((self._substeps if wanted else 0, 2, len(self.q)))
+
+    def trace(self) -> tuple[NDArray[np.int64], Floats]:
+        """Encoder counts and mean currents [A] after each substep of the last period, shape (substeps, J). Noise of the
+        encoders comes from a generator of its own, so that recording changes nothing that is recorded otherwise."""
+        noise = self._trace_rng.standard_normal(self._trace[:, 0].shape) * self._power.noise_counts
+        return np.rint(self._trace[:, 0] + noise).astype(np.int64), self._trace[:, 1]
 
     def measure(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
         """Latched at the end of `advance`: encoder counts, counts/s (difference of two latches), mean current [A]."""

@@ -10,13 +10,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from emulator.drive import Drive, Measurement
+from emulator.axis import Measurement
+from emulator.drive import Drive
 from emulator.plant import Plant
 from protocols import nmt
 from protocols.cell import CellState
-from protocols.frames import Frame
+from protocols.errorframes import Class, State, decode
+from protocols.frames import ERROR, Frame
 from protocols.rig import Rig
-from protocols.robot import Robot
+from protocols.robot import Joint, Robot
 
 SILENT_PERIODS = 20  # without SYNC for so long, the arm follows the clock: a host at rest must not freeze it
 NO_COUNTER = -1
@@ -29,6 +31,8 @@ class _Segment:
     def __init__(self, drives: list[tuple[int, Drive]]) -> None:
         self.drives = drives
         self.waiting: deque[Frame] = deque()
+        self.overheard: deque[tuple[Drive, Frame]] = deque()  # sent by one drive, meant for another
+        self.off: set[Drive] = set()  # whose controllers are bus-off
         self.latched = False  # has seen the SYNC of the present instant
         self.active = False  # carries SYNC
 
@@ -58,7 +62,18 @@ class EmulatedRig:
             np.broadcast_to(np.array(noise.encoder_noise_rad), joints).copy(),
         )
         place = {d.joint: d for d in rig.drive}
-        self.drives = [Drive(joint.drive, place[joint.name].node) for joint in machine.joint]
+        rates = {bus.name: bus.bitrate for bus in rig.bus}
+        self.drives = [
+            Drive(
+                joint.drive,
+                place[joint.name].node,
+                period_ns=self.period_ns,
+                travel=_travel(joint),
+                grid_s=self.plant.substep_s,
+                bit_rate=rates[place[joint.name].bus],
+            )
+            for joint in machine.joint
+        ]
         self._segments = [
             _Segment(
                 [
@@ -69,6 +84,7 @@ class EmulatedRig:
             )
             for bus in rig.bus
         ]
+        self._tracing = False
         self._supply_V = max(joint.drive.bus_voltage_V for joint in machine.joint)
         self._mode = np.zeros(joints, dtype=np.int64)
         self._position = np.zeros(joints)
@@ -79,6 +95,11 @@ class EmulatedRig:
         self.cycles = 0
         self.skewed = 0  # instants at which a bus had to go on without another
         self._measure()
+
+    @property
+    def nodes(self) -> list[list[int]]:
+        """Node numbers of the drives on each bus."""
+        return [[drive.device.node_id for _, drive in segment.drives] for segment in self._segments]
 
     def start(self, t_ns: int) -> list[list[Frame]]:
         """Power on: the boot-up messages, per bus."""
@@ -103,10 +124,10 @@ class EmulatedRig:
             for segment, sent in pairs:
                 self._dispatch(t_ns, segment, sent)
             progress = any([self._sync(t_ns, segment, sent) for segment, sent in pairs])
-        self._free_run(t_ns)
+        self._free_run(t_ns, pairs)
         for segment, sent in pairs:
             for _, drive in segment.drives:
-                sent.extend(drive.tick(t_ns))
+                _say(segment, drive, drive.tick(t_ns), sent)
         return out
 
     def cell(self) -> CellState:
@@ -120,11 +141,21 @@ class EmulatedRig:
 
     def _dispatch(self, t_ns: int, segment: _Segment, sent: list[Frame]) -> None:
         """Everything up to the next SYNC."""
+        for _ in range(len(segment.overheard)):  # what they say to each other meanwhile is for the next time
+            speaker, frame = segment.overheard.popleft()
+            for _, drive in segment.drives:
+                if drive is not speaker:
+                    _say(segment, drive, drive.receive(t_ns, frame), sent)
         waiting = segment.waiting
         while waiting and waiting[0].can_id != nmt.SYNC:
             frame = waiting.popleft()
+            if frame.can_id & ERROR:
+                _review(t_ns, segment, frame, sent)
+                continue
             for _, drive in segment.drives:
-                sent.extend(drive.receive(t_ns, frame))
+                answer = [] if drive in segment.off else drive.receive(t_ns, frame)
+                if answer:
+                    _say(segment, drive, answer, sent)
 
     def _sync(self, t_ns: int, segment: _Segment, sent: list[Frame]) -> bool:
         """Handle the SYNC at the head of a bus, if its instant has come."""
@@ -138,13 +169,22 @@ class EmulatedRig:
         segment.waiting.popleft()
         segment.latched = segment.active = True
         for j, drive in segment.drives:
-            sent.extend(drive.on_sync(t_ns, None if counter == NO_COUNTER else counter, self._measured[j]))
-            command = drive.command()
-            self._mode[j], self._position[j], self._current[j] = command
-            gains = drive.changed_gains()
-            if gains is not None:
-                self.plant.set_current_gains(j, *gains)
+            if drive in segment.off:
+                drive.proceed(t_ns, self._measured[j])
+            else:
+                answer = drive.on_sync(t_ns, None if counter == NO_COUNTER else counter, self._measured[j])
+                _say(segment, drive, answer, sent)
+            self._obey(j, drive)
         return True
+
+    def _obey(self, j: int, drive: Drive) -> None:
+        """Hand a drive's wishes to its power stage."""
+        self._mode[j], self._position[j], self._current[j] = drive.command()
+        gains, limit_A = drive.changed_gains(), drive.changed_limit()
+        if gains is not None:
+            self.plant.set_current_gains(j, *gains)
+        if limit_A is not None:
+            self.plant.set_current_limit(j, limit_A)
 
     def _next_instant(self, t_ns: int, counter: int) -> bool:
         """Advance the arm by one period unless another bus still owes the present instant's SYNC."""
@@ -157,24 +197,73 @@ class EmulatedRig:
             segment.active = False
             self.skewed += 1
         if t_ns - self._instant_ns < SILENT_PERIODS * self.period_ns:
-            self.plant.advance(self._mode, self._position, self._current)
-        self._measure()
+            self._advance()
+        else:
+            self._measure()
         self._counter, self._instant_ns, self._plant_ns = counter, t_ns, t_ns
         self.cycles += 1
         for segment in self._segments:
             segment.latched = False
         return True
 
-    def _free_run(self, t_ns: int) -> None:
+    def _free_run(self, t_ns: int, pairs: Sequence[tuple[_Segment, list[Frame]]]) -> None:
+        """Without SYNC the arm, and the drives' own motions, go on with the clock."""
         if t_ns - self._instant_ns < SILENT_PERIODS * self.period_ns:
             return
-        for j, drive in enumerate(self.drives):
-            self._mode[j], self._position[j], self._current[j] = drive.command()
         while self._plant_ns + self.period_ns <= t_ns:
-            self.plant.advance(self._mode, self._position, self._current)
             self._plant_ns += self.period_ns
+            self._advance()
+            for segment, sent in pairs:
+                for j, drive in segment.drives:
+                    _say(segment, drive, drive.proceed(self._plant_ns, self._measured[j]), sent)
+                    self._obey(j, drive)
+
+    def _advance(self) -> None:
+        """One period of the arm."""
+        tracing = any(drive.recorder.running for drive in self.drives)
+        if tracing is not self._tracing:
+            self._tracing = tracing
+            self.plant.keep_trace(wanted=tracing)
+        self.plant.advance(self._mode, self._position, self._current)
+        if tracing:
+            counts, current_A = self.plant.trace()
+            for j, drive in enumerate(self.drives):
+                if drive.recorder.running:
+                    drive.record(counts[:, j].tolist(), current_A[:, j].tolist())
         self._measure()
 
     def _measure(self) -> None:
         counts, speed, current = self.plant.measure()
         self._measured = list(map(Measurement, counts.tolist(), speed.tolist(), current.tolist()))
+
+
+def _say(segment: _Segment, speaker: Drive, frames: list[Frame], sent: list[Frame]) -> None:
+    """A drive sends; the others on its bus may be listening. They hear it with the rig's next step."""
+    if speaker in segment.off:
+        return
+    sent.extend(frames)
+    for frame in frames:
+        if frame.can_id == nmt.SYNC:  # a drive is the producer: everybody takes part, itself included
+            segment.waiting.append(frame)
+        elif any(drive.device.hears(frame.can_id) for _, drive in segment.drives if drive is not speaker):
+            segment.overheard.append((speaker, frame))
+
+
+def _review(t_ns: int, segment: _Segment, frame: Frame, sent: list[Frame]) -> None:
+    """A controller reports about itself: off the bus a drive neither speaks nor hears, and takes care of itself."""
+    report = decode(frame)
+    for _, drive in segment.drives:
+        if report.station not in {0, drive.device.node_id}:
+            continue
+        if report.state is State.BUS_OFF and drive not in segment.off:
+            segment.off.add(drive)
+            drive.device.lose_bus(t_ns)
+        elif report.classes & Class.RESTARTED and drive in segment.off:
+            segment.off.remove(drive)
+            _say(segment, drive, drive.device.find_bus(t_ns), sent)
+
+
+def _travel(joint: Joint) -> tuple[int, int]:
+    """Encoder counts at which the limit switches of an axis close: the ends of its joint's range."""
+    ends = [round(limit * joint.drive.counts_per_rad) for limit in (joint.position_min_rad, joint.position_max_rad)]
+    return min(ends), max(ends)

@@ -20,6 +20,8 @@ class State(Enum):
     FAULT_REACTION_ACTIVE = (0x4F, 0x0F)
     FAULT = (0x4F, 0x08)
 
+    __hash__ = object.__hash__  # by identity: states are keys in code that runs with every SYNC
+
     @property
     def mask(self) -> int:
         return self.value[0]
@@ -75,6 +77,10 @@ TRANSITIONS: Mapping[tuple[State, Command | Event], State] = {
 # --- controlword ---
 
 FAULT_RESET_BIT = 0x80
+HALT_BIT = 0x100
+START_BIT = 0x10  # profile position: new set-point; homing: start; interpolated position: enable
+IMMEDIATELY_BIT = 0x20  # profile position: do not wait for the end of the present motion
+RELATIVE_BIT = 0x40  # profile position
 
 _COMMANDS = (  # mask and value of bits 7, 3, 2, 1, 0 (CiA 402-2, table 27)
     (0x82, 0x00, Command.DISABLE_VOLTAGE),
@@ -141,14 +147,20 @@ def controlword_to_enable(state: State, previous: int) -> int:
 
 
 class Status(IntFlag):
-    """Bits of the statusword beside the state's own (CiA 402-2, table 28; modes CSP and CST)."""
+    """Bits of the statusword beside the state's own (CiA 402-2, table 28). Bits 12 and 13 mean what the mode says."""
 
     VOLTAGE_ENABLED = 0x0010
     WARNING = 0x0080
     REMOTE = 0x0200
+    TARGET_REACHED = 0x0400
     INTERNAL_LIMIT = 0x0800
-    FOLLOWS_COMMAND = 0x1000
-    FOLLOWING_ERROR = 0x2000
+    FOLLOWS_COMMAND = 0x1000  # CSP, CSV, CST
+    SETPOINT_ACKNOWLEDGE = 0x1000  # profile position
+    SPEED_ZERO = 0x1000  # profile velocity
+    HOMING_ATTAINED = 0x1000
+    INTERPOLATING = 0x1000  # interpolated position
+    FOLLOWING_ERROR = 0x2000  # position modes
+    HOMING_ERROR = 0x2000
 
 
 def state_of(statusword: int) -> State | None:
@@ -160,16 +172,36 @@ def state_of(statusword: int) -> State | None:
 
 
 class Mode(IntEnum):
-    """Modes of operation, objects 0x6060 and 0x6061, that armrig's drives have: cyclic synchronous position, torque."""
+    """Modes of operation, objects 0x6060 and 0x6061 (CiA 402-2, table 80)."""
 
     NONE = 0
+    PROFILE_POSITION = 1
+    PROFILE_VELOCITY = 3
+    PROFILE_TORQUE = 4
+    HOMING = 6
+    INTERPOLATED_POSITION = 7
     CSP = 8
+    CSV = 9
     CST = 10
 
 
-SUPPORTED = (Mode.CSP, Mode.CST)
+SUPPORTED = tuple(mode for mode in Mode if mode is not Mode.NONE)
 
 
 def supported_modes(modes: Iterable[Mode]) -> int:
     """Value of 0x6502: bit n - 1 stands for mode n."""
     return sum(1 << (mode - 1) for mode in modes)
+
+
+class Homing(IntEnum):
+    """Homing methods, object 0x6098 (CiA 402-2, 8.3), that armrig's drives have."""
+
+    NONE = 0
+    NEGATIVE_LIMIT_AND_INDEX = 1
+    POSITIVE_LIMIT_AND_INDEX = 2
+    NEGATIVE_LIMIT = 17
+    POSITIVE_LIMIT = 18
+    NEGATIVE_INDEX = 33
+    POSITIVE_INDEX = 34
+    CURRENT_POSITION_OLD = 35
+    CURRENT_POSITION = 37

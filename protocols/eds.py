@@ -40,7 +40,7 @@ def eds(dictionary: Dictionary, file_name: str = "drive.eds") -> str:
             GroupMessaging="0",
             NrOfRXPDO=str(PDOS),
             NrOfTXPDO=str(PDOS),
-            LSS_Supported="0",
+            LSS_Supported="1",
         ),
         _section("DummyUsage", **{f"Dummy{i:04d}": "0" for i in range(1, 8)}),
         _list("MandatoryObjects", _MANDATORY),
@@ -80,9 +80,10 @@ def _entry(entry: Entry) -> dict[str, str]:
         "ParameterName": entry.name,
         "DataType": f"0x{entry.type:04X}",
         "AccessType": entry.access,
-        "DefaultValue": ("$NODEID+" if entry.node_relative else "") + _value(entry, entry.default),
-        "PDOMapping": str(int(entry.mappable)),
     }
+    if entry.type is not Type.DOMAIN:
+        keys["DefaultValue"] = ("$NODEID+" if entry.node_relative else "") + _value(entry, entry.default)
+    keys["PDOMapping"] = str(int(entry.mappable))
     if entry.low is not None:
         keys["LowLimit"] = _value(entry, entry.low)
     if entry.high is not None:

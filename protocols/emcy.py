@@ -22,7 +22,10 @@ class Register(IntFlag):
 
 
 class Code(IntEnum):
-    """Error codes that armrig's devices send (CiA 301, table 26; CiA 402-2, table 18)."""
+    """Error codes that armrig's devices send (CiA 301, table 26; CiA 402-2, table 18).
+
+    `SYNC_JUMP` is ours in the class of 0x8700: the SYNC counter left out a value or repeated one. A warning.
+    """
 
     NONE = 0x0000
     OVERCURRENT = 0x2310
@@ -31,10 +34,13 @@ class Code(IntEnum):
     DRIVE_OVERTEMPERATURE = 0x4310
     ENCODER = 0x7305
     HEARTBEAT_LOST = 0x8130
+    BUS_OFF_RECOVERED = 0x8140
     PDO_LENGTH = 0x8210
     SYNC_LENGTH = 0x8240
+    RPDO_TIMEOUT = 0x8250
     FOLLOWING_ERROR = 0x8611
     SYNC_LOST = 0x8700
+    SYNC_JUMP = 0x8701
 
 
 _CLASS = {  # first digits of the code, longest match first
@@ -54,6 +60,10 @@ def register_of(code: int) -> Register:
     if code == Code.NONE:
         return Register(0)
     return Register.GENERIC | _CLASS.get(code >> 8, _CLASS.get(code >> 12, Register.GENERIC))
+
+
+# Reported by a drive that goes on working.
+WARNINGS = frozenset({Code.SYNC_LENGTH, Code.SYNC_JUMP, Code.PDO_LENGTH, Code.RPDO_TIMEOUT, Code.BUS_OFF_RECOVERED})
 
 
 class Emergency(NamedTuple):

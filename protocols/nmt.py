@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from enum import IntEnum
 
-from protocols.frames import Frame
+from protocols.frames import REMOTE, Frame
 
 # Predefined connection set (CiA 301, table 38 and 39).
 NMT = 0x000
@@ -123,3 +123,13 @@ def next_counter(counter: int, overflow: int) -> int:
         overflow: 0x1019, the largest value; 1 follows it.
     """
     return counter % overflow + 1
+
+
+def guard_request(node: int) -> Frame:
+    """Remote frame by which a master asks for a node's state (node guarding, CiA 301, 7.2.8.2.1)."""
+    return Frame(heartbeat_id(node) | REMOTE, b"", 1)
+
+
+def guard_response(node: int, state: State, toggle: int) -> Frame:
+    """Answer to `guard_request`; the toggle bit alternates from 0."""
+    return Frame(heartbeat_id(node), bytes((state | toggle << 7,)))

@@ -27,6 +27,7 @@ class Type(IntEnum):
     UNSIGNED32 = 0x07
     REAL32 = 0x08
     VISIBLE_STRING = 0x09
+    DOMAIN = 0x0F
 
 
 class Code(IntEnum):
@@ -37,7 +38,7 @@ class Code(IntEnum):
     RECORD = 0x09
 
 
-FORMAT = {  # of `struct`, little-endian; strings have none
+FORMAT = {  # of `struct`, little-endian; strings and domains have none
     Type.INTEGER8: "b",
     Type.INTEGER16: "h",
     Type.INTEGER32: "i",
@@ -62,6 +63,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
         low, high: Limits of what may be written; None where the type alone limits.
         mappable: May be part of a PDO.
         unit: For people and generated documents.
+        volatile: A command or a history, not a setting: never stored by 0x1010.
     """
 
     index: int
@@ -75,6 +77,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
     mappable: bool = False
     unit: str = ""
     node_relative: bool = False
+    volatile: bool = False
 
     @property
     def key(self) -> int:
@@ -90,7 +93,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def bits(self) -> int:
-        """Length in a PDO; 0 for strings."""
+        """Length in a PDO; 0 for strings and domains."""
         return 8 * _CODEC[self.type].size if self.type in _CODEC else 0
 
     @property
@@ -106,7 +109,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
 
     def decode(self, data: bytes) -> Value:
         """Value of bytes; their number must be within `sizes`."""
-        if self.type is Type.VISIBLE_STRING:
+        if self.type not in _CODEC:
             return data.decode("latin-1")
         value: int | float = _CODEC[self.type].unpack(data)[0]
         return value
@@ -175,6 +178,7 @@ class Options(TypedDict, total=False):
     mappable: bool
     unit: str
     node_relative: bool
+    volatile: bool
 
 
 def sub(number: int, name: str, kind: Type, access: Access, default: Value, **options: Unpack[Options]) -> Entry:

@@ -17,6 +17,7 @@ from protocols.sdo import Abort, SdoError
 
 LAST_SYNCHRONOUS = 240  # transmission types 0 and 1 to 240 follow SYNC
 EVENT_TYPES = (254, 255)
+SAMPLED_ON_SYNC, ON_REQUEST = 252, 253  # sent when a remote frame asks for them
 RECEIVE = 0x1400  # communication parameters of RPDO 1; the mappings are 0x200 above
 TRANSMIT = 0x1800
 MAPPING_OFFSET = 0x200

@@ -27,6 +27,9 @@ class Abort(IntEnum):
     TOGGLE = 0x0503_0000
     TIMEOUT = 0x0504_0000
     COMMAND = 0x0504_0001
+    BLOCK_SIZE = 0x0504_0002
+    SEQUENCE = 0x0504_0003
+    CRC = 0x0504_0004
     WRITE_ONLY = 0x0601_0001
     READ_ONLY = 0x0601_0002
     NO_OBJECT = 0x0602_0000
@@ -41,6 +44,7 @@ class Abort(IntEnum):
     TOO_HIGH = 0x0609_0031
     TOO_LOW = 0x0609_0032
     GENERAL = 0x0800_0000
+    NOT_STORED = 0x0800_0020
     STATE = 0x0800_0022
     NO_DATA = 0x0800_0024
 
@@ -49,6 +53,9 @@ _MEANING = {
     Abort.TOGGLE: "the toggle bit did not alternate",
     Abort.TIMEOUT: "no answer in time",
     Abort.COMMAND: "unknown or unexpected command specifier",
+    Abort.BLOCK_SIZE: "a block must have 1 to 127 segments",
+    Abort.SEQUENCE: "a segment number that cannot be",
+    Abort.CRC: "the checksum of the block transfer is wrong",
     Abort.WRITE_ONLY: "the object cannot be read",
     Abort.READ_ONLY: "the object cannot be written",
     Abort.NO_OBJECT: "there is no such object",
@@ -63,6 +70,7 @@ _MEANING = {
     Abort.TOO_HIGH: "the value is above the object's limit",
     Abort.TOO_LOW: "the value is below the object's limit",
     Abort.GENERAL: "general error",
+    Abort.NOT_STORED: "the data cannot be transferred or stored",
     Abort.STATE: "not possible in the present device state",
     Abort.NO_DATA: "no data available",
 }

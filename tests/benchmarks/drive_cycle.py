@@ -3,7 +3,8 @@
 import struct
 import time
 
-from emulator.drive import Drive, Measurement
+from emulator.axis import Measurement
+from emulator.drive import Drive
 from protocols import cia402, nmt
 from protocols.frames import Frame
 from protocols.robot import Drive as Config
@@ -21,14 +22,14 @@ def main() -> None:
     targets = [Frame(nmt.rpdo_id(2, 5), struct.pack("<hi", n % 900, n)) for n in range(CYCLES)]
     measurements = [Measurement(n, 3 * n, 1e-4 * n % 2) for n in range(CYCLES)]
     sent = 0
-    start = time.perf_counter_ns()
+    start = time.process_time_ns()
     for n in range(CYCLES):
         t_ns = n * PERIOD_NS
         drive.receive(t_ns, targets[n])
         sent += len(drive.on_sync(t_ns, n % 240 + 1, measurements[n]))
         drive.command()
         drive.tick(t_ns)
-    elapsed = time.perf_counter_ns() - start
+    elapsed = time.process_time_ns() - start
     if drive.state is not cia402.State.OPERATION_ENABLED or sent < CYCLES:
         raise SystemExit(f"the drive did not run: {drive.state}, {sent} frames sent")
     print(f"{elapsed / CYCLES / 1000:.2f} us per drive and cycle ({sent} frames sent)")

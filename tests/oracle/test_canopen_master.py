@@ -12,11 +12,12 @@ import canopen
 import pytest
 from canopen.profiles.p402 import BaseNode402
 
-from emulator.drive import Drive, Measurement
+from emulator.axis import Measurement
+from emulator.drive import Drive
 from protocols import emcy, nmt
 from protocols.eds import eds
 from protocols.frames import EXTENDED, REMOTE, Frame
-from protocols.objects import Code
+from protocols.objects import Code, Type
 from protocols.robot import Drive as Config
 
 NODE = 5
@@ -24,11 +25,16 @@ CONFIG = Config(gear_ratio=-32.0, drive_gain_Nm_A=10.0, rated_current_A=2.0, max
 
 
 class DriveBus(can.BusABC):
-    """A CAN bus with one drive on it. Time runs as it does for the master, whose timeouts are real."""
+    """A CAN bus with one drive on it. Time runs as it does for the master, whose timeouts are real.
+
+    Attributes:
+        moving: The axis goes where the drive sends it.
+    """
 
     def __init__(self, drive: Drive) -> None:
         super().__init__(channel="drive")
         self.drive = drive
+        self.moving = False
         self._lock = threading.Lock()
         self._frames: queue.SimpleQueue[Frame] = queue.SimpleQueue()
         self._start_ns = time.monotonic_ns()
@@ -59,6 +65,9 @@ class DriveBus(can.BusABC):
         while True:
             with self._lock:
                 self._put(self.drive.tick(self.now_ns()))
+                if self.moving:
+                    there = Measurement(round(self.drive.command().target_position), 0, 0.0)
+                    self._put(self.drive.proceed(self.now_ns(), there))
             try:
                 frame = self._frames.get(timeout=1e-3)
             except queue.Empty:
@@ -107,8 +116,8 @@ def test_reset_gives_one_boot_up(node: BaseNode402) -> None:
 def test_every_readable_object_uploads_its_default(node: BaseNode402) -> None:
     store = Drive(CONFIG, NODE).device.store
     for entry in store.dictionary.entries.values():
-        if entry.index == 0x1003 and entry.sub:
-            continue  # no error, no entry
+        if (entry.index == 0x1003 and entry.sub) or entry.type is Type.DOMAIN:
+            continue  # no error, no entry; nothing recorded
         item = node.sdo[entry.index]
         value = (item if store.dictionary.objects[entry.index].code is Code.VAR else item[entry.sub]).raw
         expected = store.values[entry.key]
@@ -143,10 +152,93 @@ def test_abort_codes(node: BaseNode402, index: int, sub: int, data: bytes, code:
     assert error.value.code == code
 
 
-def test_block_transfer_is_refused(node: BaseNode402) -> None:
+@pytest.mark.parametrize("size", [5, 7, 13, 63])
+def test_block_download(node: BaseNode402, bus: DriveBus, size: int) -> None:
+    name = bytes(ord("a") + i % 26 for i in range(size))
+    with node.sdo[0x2000].open("wb", block_transfer=True, size=size) as file:
+        file.write(name)
+    assert bus.drive.device.store.values[0x2000_00] == name.decode()
+    assert node.sdo.upload(0x2000, 0) == name
+
+
+@pytest.mark.parametrize("with_crc", [True, False])
+@pytest.mark.parametrize("samples", [1, 111, 1000])  # the largest is nine blocks
+def test_block_upload_of_the_recorder(node: BaseNode402, bus: DriveBus, samples: int, with_crc: bool) -> None:
+    node.sdo["Recorder"]["Samples"].raw = samples
+    node.sdo["Recorder"]["Control"].raw = 1
+    bus.drive.record(range(2 * samples), [0.001 * n for n in range(2 * samples)])
+    assert node.sdo["Recorder"]["State"].raw == 3
+    with node.sdo[0x2041].open("rb", block_transfer=True, request_crc_support=with_crc, buffering=0) as file:
+        data = b"".join(iter(lambda: file.read(7), b""))
+    assert len(data) == 8 * samples
+    assert data == bus.drive.recorder.data()
+    assert struct.unpack_from("<ii", data, 8 * (samples - 1)) == (2 * samples - 1, 2 * samples - 2)
+
+
+def test_block_download_that_is_too_long(node: BaseNode402) -> None:
     with pytest.raises(canopen.SdoAbortedError) as error:
-        node.sdo[0x2000].open("wb", block_transfer=True, size=20)
-    assert error.value.code == 0x05040001
+        node.sdo[0x2000].open("wb", block_transfer=True, size=65)
+    assert error.value.code == 0x06070012
+
+
+def test_stored_parameters(node: BaseNode402) -> None:
+    node.sdo["Following error window"].raw = 1234
+    node.store()
+    node.nmt.send_command(nmt.Command.RESET_NODE)
+    assert node.sdo["Following error window"].raw == 1234
+    node.restore()
+    node.nmt.send_command(nmt.Command.RESET_NODE)
+    assert node.sdo["Following error window"].raw == 131_072
+
+
+def test_node_guarding(node: BaseNode402) -> None:
+    answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    node.network.subscribe(0x700 + NODE, lambda _, data, __: answers.put(bytes(data)))
+    for _ in range(2):
+        node.network.send_message(0x700 + NODE, b"", remote=True)
+    node.sdo[0x1000].raw  # noqa: B018 -- answered after the two
+    seen = [answers.get_nowait() for _ in range(answers.qsize())]
+    assert seen[-2:] == [b"\x7f", b"\xff"]
+
+
+def test_lss(node: BaseNode402, bus: DriveBus) -> None:
+    lss = node.network.lss
+    lss.RESPONSE_TIMEOUT = 2.0
+    assert lss.send_switch_state_selective(0, 0x4152_4D52, 0x0001_0000, NODE) is True
+    assert lss.inquire_node_id() == NODE
+    assert lss.inquire_lss_address(0x5D) == NODE  # serial number
+    lss.configure_node_id(9)
+    lss.configure_bit_timing(2)
+    lss.store_configuration()
+    lss.send_switch_state_global(lss.WAITING_STATE)
+    assert node.sdo[0x1000].raw == 0x0002_0192  # the node-id counts from the next reset of communication
+    node.nmt.send_command(nmt.Command.RESET_COMMUNICATION)
+    moved = canopen.RemoteNode(9, data_sheet())
+    node.network.add_node(moved)
+    moved.sdo.RESPONSE_TIMEOUT = 2.0
+    assert moved.sdo[0x1000].raw == 0x0002_0192
+    assert moved.sdo[0x1800][1].raw == 0x4000_0189
+    assert bus.drive.device.node_id == 9
+
+
+def test_lss_fast_scan_finds_a_drive_without_node_id() -> None:
+    bus = DriveBus(Drive(CONFIG, 0xFF, serial=0xDEAD_BEEF))
+    network = canopen.Network(bus)
+    network.NOTIFIER_CYCLE = 0.02
+    network.connect()
+    try:
+        network.lss.RESPONSE_TIMEOUT = 0.02  # most of its questions are answered by silence
+        found, identity = network.lss.fast_scan()
+        assert found and identity == [0, 0x4152_4D52, 0x0001_0000, 0xDEAD_BEEF]
+        network.lss.RESPONSE_TIMEOUT = 2.0
+        network.lss.configure_node_id(7)
+        network.lss.send_switch_state_global(network.lss.WAITING_STATE)
+        node = canopen.RemoteNode(7, data_sheet())
+        network.add_node(node)
+        node.sdo.RESPONSE_TIMEOUT = 2.0
+        assert node.sdo[0x1018][4].raw == 0xDEAD_BEEF
+    finally:
+        network.disconnect()
 
 
 def test_pdo_configuration_and_exchange(node: BaseNode402, bus: DriveBus) -> None:
@@ -209,8 +301,35 @@ def test_walk_to_operation_enabled(node: BaseNode402, bus: DriveBus) -> None:
     assert bus.drive.command().target_current_A == pytest.approx(1.0)
     node.state = "SWITCH ON DISABLED"
     assert bus.drive.command().mode == 0
-    with pytest.raises(TypeError, match="HOMING"):
-        node.op_mode = "HOMING"
+
+
+def test_homing_by_its_own_procedure(node: BaseNode402, bus: DriveBus) -> None:
+    node.nmt.state = "OPERATIONAL"
+    node.setup_402_state_machine()
+    bus.moving = True
+    node.sdo["Homing method"].raw = 35
+    node.sdo["Home offset"].raw = 123
+    assert node.homing(timeout=5)
+    assert node.sdo["Position actual value"].raw == 123
+
+
+def test_profile_position_with_its_own_handshake(node: BaseNode402, bus: DriveBus) -> None:
+    node.nmt.state = "OPERATIONAL"
+    node.setup_402_state_machine()
+    bus.moving = True
+    node.sdo["Profile velocity"].raw = 2**24
+    node.sdo["Profile acceleration"].raw = node.sdo["Profile deceleration"].raw = 2**28
+    node.op_mode = "PROFILED POSITION"
+    node.state = "OPERATION ENABLED"
+    node.sdo["Target position"].raw = 50_000
+    node.sdo["Controlword"].raw = 0x1F
+    deadline = time.monotonic() + 5
+    while not node.sdo["Statusword"].raw & 0x400:
+        assert time.monotonic() < deadline
+    assert node.sdo["Position actual value"].raw == 50_000
+    assert node.sdo["Statusword"].raw & 0x1000  # the set-point is acknowledged until bit 4 falls
+    node.sdo["Controlword"].raw = 0x0F
+    assert not node.sdo["Statusword"].raw & 0x1000
 
 
 def test_fault_and_way_back(node: BaseNode402, bus: DriveBus) -> None:

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from emulator.drive import Drive, Measurement
+from emulator.axis import Measurement
+from emulator.drive import Drive
 from protocols import cia402, emcy, nmt, sdo
 from protocols.dictionary import drive_dictionary
 from protocols.frames import ERROR, EXTENDED, REMOTE, Frame

@@ -4,8 +4,9 @@ import struct
 
 import pytest
 
-from emulator.drive import Drive, Measurement
-from protocols import cia402, nmt, sdo
+from emulator.axis import Measurement
+from emulator.drive import Drive
+from protocols import cia402, nmt, sdo, sdoblock
 from protocols.frames import Frame
 from protocols.robot import Drive as Config
 
@@ -22,10 +23,10 @@ class Bench:
     node = 5
     config = Config(gear_ratio=-32.0, drive_gain_Nm_A=10.0, rated_current_A=2.0, max_current_A=8.0)
 
-    def __init__(self) -> None:
+    def __init__(self, **options: object) -> None:
         self.t_ns = 0
         self.counter = 0
-        self.drive = Drive(self.config, self.node)
+        self.drive = Drive(self.config, self.node, **options)
         self.measurement = Measurement(0, 0, 0.0)
         self.log: list[Frame] = []
         self.keep(self.drive.start(0))
@@ -41,11 +42,12 @@ class Bench:
         return self.keep(self.drive.receive(self.t_ns, nmt.command(command, node)))
 
     def wait(self, milliseconds: float, step_ms: float = 1.0) -> list[Frame]:
-        """Let time pass without SYNC."""
+        """Let time pass without SYNC; the axis moves on with every step, as in the rig."""
         frames = []
         for _ in range(round(milliseconds / step_ms)):
             self.t_ns += round(step_ms * MS)
             frames += self.drive.tick(self.t_ns)
+            frames += self.drive.proceed(self.t_ns, self.measurement)
         return self.keep(frames)
 
     def sync(self, count: int = 1) -> list[Frame]:
@@ -80,6 +82,14 @@ class Bench:
             request = transfer.receive(answers[0].data)
         assert transfer.done
 
+    def run_block(self, transfer: sdoblock.BlockUpload | sdoblock.BlockDownload) -> None:
+        """Bring an SDO block transfer to its end."""
+        requests = [transfer.request()]
+        while requests:
+            answers = [f for r in requests for f in self.send(nmt.sdo_request_id(self.node), r)]
+            requests = [r for f in answers if f.can_id == 0x580 + self.node for r in transfer.receive(f.data)]
+        assert transfer.done
+
     def refused(self, index: int, sub: int, value: int, size: int) -> sdo.Abort:
         """Abort code that a download ends with."""
         with pytest.raises(sdo.SdoError) as error:
@@ -110,6 +120,12 @@ class Bench:
 @pytest.fixture
 def bench() -> Bench:
     return Bench()
+
+
+@pytest.fixture
+def make_bench() -> type[Bench]:
+    """Benches with options of the drive."""
+    return Bench
 
 
 def emergencies(frames: list[Frame]) -> list[tuple[int, int]]:

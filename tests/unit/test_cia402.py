@@ -79,4 +79,4 @@ def test_fault_reset_needs_two_controlwords_where_bit_7_is_high() -> None:
 
 
 def test_supported_modes() -> None:
-    assert supported_modes(SUPPORTED) == 0x280
+    assert supported_modes(SUPPORTED) == 0x3ED

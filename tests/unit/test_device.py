@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from emulator.device import Device
-from protocols import nmt, pdo, sdo
+from protocols import nmt, pdo, sdo, sdoblock
 from protocols.dictionary import communication_objects
 from protocols.frames import ERROR, EXTENDED, REMOTE, Frame
 from protocols.objects import Dictionary
@@ -121,9 +121,12 @@ def test_mapping_refusals(bench) -> None:
     assert bench.refused(0x1A00, 0, 0, 1) is Abort.STATE  # mapping only while the PDO is off
 
 
-def test_block_transfers_are_refused(bench) -> None:
-    assert abort_of(bench.send(0x605, bytes.fromhex("c200200004000000"))) == Abort.COMMAND
-    assert abort_of(bench.send(0x605, bytes.fromhex("a008100000000000"))) == Abort.COMMAND
+def test_block_transfers(bench) -> None:
+    name = b"shoulder of the arm that stands on the left"
+    bench.run_block(sdoblock.BlockDownload(0x2000, 0, name))
+    upload = sdoblock.BlockUpload(0x2000, 0)
+    bench.run_block(upload)
+    assert upload.data == bench.read(0x2000) == name
 
 
 # --- network management ---
@@ -181,7 +184,7 @@ def test_heartbeat_keeps_its_grid_and_never_bursts(bench) -> None:
 def test_flagged_frames_are_counted_and_ignored(bench, flag: int) -> None:
     bench.nmt(START)
     state = bench.drive.device.state
-    for can_id in (0x000, 0x205, 0x305, 0x605, 0x705):
+    for can_id in (0x000, 0x205, 0x305, 0x605, 0x706):
         assert bench.send(can_id | flag, b"\x81\x05\0\0\0\0\0\0") == []
     assert bench.drive.device.ignored == 5
     assert bench.drive.device.state is state
@@ -206,9 +209,92 @@ def test_transmission_types(bench) -> None:
     assert [f.can_id for f in bench.sync()] == [0x385]
 
 
-@pytest.mark.parametrize("kind", [241, 251, 252, 253])
+@pytest.mark.parametrize("kind", [241, 251])
 def test_transmission_types_that_are_refused(bench, kind: int) -> None:
     assert bench.refused(0x1800, 2, kind, 1) is Abort.VALUE
+
+
+@pytest.mark.parametrize("kind", [252, 253])
+def test_an_rpdo_cannot_be_asked_for(bench, kind: int) -> None:
+    assert bench.refused(0x1400, 2, kind, 1) is Abort.VALUE
+
+
+def ask(bench, cob_id: int) -> list[bytes]:
+    """Data that a remote frame brings."""
+    return [f.data for f in bench.send(cob_id | REMOTE) if f.can_id == cob_id]
+
+
+def allow_rtr(bench, number: int) -> None:
+    """Clear bit 30 of a TPDO's COB-ID."""
+    cob_id = nmt.tpdo_id(number, bench.node)
+    bench.write(0x1800 + number - 1, 1, 0x8000_0000 | cob_id, 4)
+    bench.write(0x1800 + number - 1, 1, cob_id, 4)
+
+
+def test_tpdo_sampled_on_sync_and_sent_on_request(bench) -> None:
+    remap(bench, 3, ["2001:0/16"], 252)
+    allow_rtr(bench, 3)
+    bench.nmt(START)
+    assert ask(bench, 0x385) == []  # nothing sampled yet
+    assert [f.can_id for f in bench.sync(3)] == [0x185] * 3
+    assert ask(bench, 0x385) == [b"\3\0"] == ask(bench, 0x385)
+
+
+def test_tpdo_sampled_and_sent_on_request(bench) -> None:
+    remap(bench, 3, ["6071:0/16"], 253)
+    bench.nmt(START)
+    bench.write(0x6071, 0, 7, 2)
+    assert ask(bench, 0x385) == []  # bit 30 is still set: no remote frames
+    allow_rtr(bench, 3)
+    assert ask(bench, 0x385) == [b"\7\0"]
+    bench.write(0x6071, 0, 8, 2)
+    assert ask(bench, 0x385) == [b"\x08\0"]
+    bench.nmt(STOP)
+    assert ask(bench, 0x385) == []
+
+
+def test_any_tpdo_may_be_asked_for(bench) -> None:
+    allow_rtr(bench, 1)
+    bench.nmt(START)
+    bench.sync(5)
+    assert ask(bench, 0x185) == [struct.pack("<ihH", 0, 0, 5)]
+
+
+def test_sync_start_value(bench) -> None:
+    bench.write(0x1019, 0, 10, 1)
+    remap(bench, 1, ["2001:0/16"], 1)
+    remap(bench, 3, ["2001:0/16"], 3)
+    assert bench.refused(0x1800, 6, 4, 1) is Abort.STATE
+    for index, cob_id in ((0x1800, 0x185), (0x1802, 0x385)):
+        bench.write(index, 1, 0xC000_0000 | cob_id, 4)
+        bench.write(index, 6, 4, 1)
+        bench.write(index, 1, 0x4000_0000 | cob_id, 4)
+    bench.nmt(START)
+    sent = [sorted(f.can_id for f in bench.sync() if f.can_id != 0x285) for _ in range(7)]
+    assert sent == [[], [], [], [0x185], [0x185], [0x185, 0x385], [0x185]]
+
+
+def test_rpdo_deadline(bench, emergencies) -> None:
+    bench.write(0x1401, 5, 20, 2)
+    bench.nmt(START)
+    assert emergencies(bench.wait(100)) == []  # watched from the first one on
+    bench.target()
+    assert emergencies(bench.wait(19)) == []
+    assert emergencies(bench.wait(1)) == [(0x8250, 0x11)]
+    assert emergencies(bench.target()) == [(0, 0)]
+
+
+def test_synchronous_window(bench) -> None:
+    bench.write(0x1007, 0, 300, 4)
+    bench.nmt(START)
+    bench.sync()
+    bench.target(torque=5)
+    bench.sync()
+    assert bench.read_int(0x6071) == 5
+    bench.t_ns += 400_000
+    bench.target(torque=6)
+    bench.sync()
+    assert bench.read_int(0x6071) == 5
 
 
 def test_event_driven_tpdo_with_inhibit_time(bench) -> None:
@@ -281,7 +367,7 @@ def test_refused_identifiers(bench) -> None:
 
 def test_rpdo_cannot_write_what_an_sdo_cannot(bench) -> None:
     bench.nmt(START)
-    bench.control(0, 9)  # mode CSV is not supported
+    bench.control(0, 2)  # mode velocity of CiA 402 is not supported
     assert bench.read_int(0x6060) == 0
     bench.control(0, 10)
     assert bench.read_int(0x6060) == 10
@@ -322,10 +408,62 @@ def test_sync_without_the_counter_that_was_agreed_on(bench, emergencies) -> None
     assert emergencies(bench.sync()) == [(0, 0)]
 
 
-def test_sync_object_cannot_leave_the_rigs_clock(bench) -> None:
-    assert bench.refused(0x1005, 0, 0x4000_0080, 4) is Abort.VALUE  # no SYNC producer
-    assert bench.refused(0x1005, 0, 0x81, 4) is Abort.VALUE
+def test_sync_on_another_identifier(bench) -> None:
+    assert bench.refused(0x1005, 0, 0x605, 4) is Abort.VALUE
+    assert bench.refused(0x1005, 0, 0x2000_0081, 4) is Abort.VALUE  # 29-bit
+    bench.write(0x1005, 0, 0x81, 4)
+    bench.nmt(START)
+    bench.target(torque=5)
+    assert bench.sync(3) == []
+    assert bench.read_int(0x6071) == 0
+    assert [f.can_id for f in bench.send(0x81)] == [0x185]
+    assert bench.read_int(0x6071) == 5 and bench.read_int(0x2001) == 1
+
+
+def test_sync_producer(bench) -> None:
+    bench.write(0x1019, 0, 3, 1)
+    bench.write(0x1005, 0, 0x4000_0080, 4)
+    assert bench.refused(0x1005, 0, 0x4000_0081, 4) is Abort.STATE  # not while it produces
+    assert bench.wait(20) == []  # no period yet
+    bench.write(0x1006, 0, 5000, 4)
+    assert [f.data[0] for f in bench.wait(26)] == [1, 2, 3, 1, 2]
+    bench.nmt(STOP)
+    assert bench.wait(20) == []
+    bench.nmt(START)
+    assert [f.data[0] for f in bench.wait(15) if f.can_id == 0x80] == [1, 2, 3]
     bench.write(0x1005, 0, 0x80, 4)
+    assert [f for f in bench.wait(20) if f.can_id == 0x80] == []
+
+
+def test_jump_of_the_sync_counter(bench, emergencies) -> None:
+    bench.write(0x1019, 0, 240, 1)
+    bench.nmt(START)
+    assert emergencies(bench.sync(300)) == []  # across the overflow
+    bench.counter += 3
+    assert emergencies(bench.sync()) == [(0x8701, 0x21)]
+    assert emergencies(bench.sync()) == [(0, 0)]
+    bench.counter -= 1  # the same one twice
+    assert emergencies(bench.sync(2)) == [(0x8701, 0x21), (0, 0)]
+    bench.nmt(STOP)
+    bench.counter = 0
+    bench.nmt(START)
+    assert emergencies(bench.sync(2)) == []  # it may begin anew after STOPPED
+
+
+# --- TIME ---
+
+
+def test_time_of_day(bench) -> None:
+    assert [bench.read_int(0x2004, i) for i in (1, 2)] == [0, 0]
+    bench.send(nmt.TIME, struct.pack("<IH", 0xF000_0000 | 86_399_000, 14_000))
+    bench.wait(2500)
+    assert [bench.read_int(0x2004, i) for i in (1, 2)] == [1500, 14_001]
+    bench.send(nmt.TIME, b"short")
+    assert bench.read_int(0x2004, 2) == 14_001
+    bench.write(0x1012, 0, 0x100, 4)  # not consumed any more
+    bench.send(nmt.TIME, bytes(6))
+    assert bench.read_int(0x2004, 2) == 14_001
+    assert bench.refused(0x1012, 0, 0x4000_0100, 4) is Abort.VALUE  # no producer
 
 
 # --- EMCY ---
@@ -432,6 +570,78 @@ def test_one_node_cannot_be_watched_twice(bench) -> None:
     bench.write(0x1016, 2, 126 << 16 | 10, 4)
 
 
+# --- node guarding ---
+
+
+def guard(bench) -> list[Frame]:
+    return bench.send(0x705 | REMOTE)
+
+
+def test_node_guarding_toggles(bench) -> None:
+    assert [guard(bench) for _ in range(3)] == [[Frame(0x705, bytes((s,)))] for s in (0x7F, 0xFF, 0x7F)]
+    bench.nmt(STOP)
+    assert guard(bench) == [Frame(0x705, b"\x84")]
+    bench.nmt(nmt.Command.RESET_COMMUNICATION)
+    assert guard(bench) == [Frame(0x705, b"\x7f")]
+
+
+def test_heartbeat_excludes_guarding(bench) -> None:
+    bench.write(0x1017, 0, 100, 2)
+    assert guard(bench) == []
+
+
+def test_life_guarding(bench, emergencies) -> None:
+    bench.write(0x100C, 0, 20, 2)
+    bench.write(0x100D, 0, 3, 1)
+    bench.nmt(START)
+    assert emergencies(bench.wait(200)) == []  # from the first question on
+    guard(bench)
+    assert emergencies(bench.wait(59)) == []
+    guard(bench)
+    assert emergencies(bench.wait(60)) == [(0x8130, 0x11)]
+    assert bench.drive.device.state is nmt.State.PRE_OPERATIONAL
+    assert emergencies(guard(bench)) == [(0, 0)]
+    bench.write(0x100D, 0, 0, 1)
+    assert emergencies(bench.wait(200)) == []
+
+
+# --- storing ---
+
+
+def test_stored_parameters_survive_resets(bench) -> None:
+    assert bench.read_int(0x1010, 1) == bench.read_int(0x1011, 1) == 1
+    for value in (0, 1, 0x65766174):
+        assert bench.refused(0x1010, 1, value, 4) is Abort.NOT_STORED
+    bench.write(0x1017, 0, 250, 2)
+    bench.write(0x6065, 0, 777, 4)
+    bench.write(0x6040, 0, 0x06, 2)
+    bench.write_bytes(0x1010, 1, b"save")
+    bench.write(0x6065, 0, 778, 4)
+    bench.nmt(nmt.Command.RESET_NODE)
+    assert (bench.read_int(0x1017), bench.read_int(0x6065)) == (250, 777)
+    assert bench.read_int(0x6040) == 0  # commands are not settings
+    assert bench.read_int(0x1010, 1) == 1
+    bench.keep(bench.drive.start(bench.t_ns))  # power off and on
+    assert bench.read_int(0x6065) == 777
+    bench.write_bytes(0x1011, 1, b"load")
+    assert bench.read_int(0x6065) == 777  # from the next reset on
+    bench.nmt(nmt.Command.RESET_NODE)
+    assert (bench.read_int(0x1017), bench.read_int(0x6065)) == (0, 131_072)
+
+
+def test_areas_are_stored_apart(bench) -> None:
+    settings = ((0x1017, 2), (0x2003, 2), (0x6065, 4))
+    for index, size in settings:
+        bench.write(index, 0, 55, size)
+    bench.write_bytes(0x1010, 2, b"save")
+    bench.write_bytes(0x1010, 4, b"save")
+    bench.nmt(nmt.Command.RESET_NODE)
+    assert [bench.read_int(index) for index, _ in settings] == [55, 55, 131_072]
+    bench.write_bytes(0x1011, 2, b"load")
+    bench.nmt(nmt.Command.RESET_COMMUNICATION)
+    assert [bench.read_int(index) for index, _ in settings] == [0, 55, 131_072]
+
+
 # --- SDO on the bus ---
 
 
@@ -455,6 +665,13 @@ def test_access(bench) -> None:
 
 def test_identity(bench) -> None:
     assert [bench.read_int(0x1018, i) for i in range(5)] == [4, 0, 0x4152_4D52, 0x0001_0000, 5]
+
+
+def test_bus_off(bench, emergencies) -> None:
+    bench.nmt(START)
+    bench.drive.device.lose_bus(bench.t_ns)
+    assert bench.drive.device.state is nmt.State.PRE_OPERATIONAL  # 0x1029
+    assert emergencies(bench.drive.device.find_bus(bench.t_ns)) == [(0x8140, 0x11), (0, 0)]
 
 
 def test_device_without_an_application() -> None:

@@ -5,7 +5,9 @@ import struct
 
 import pytest
 
-from emulator.drive import BRAKE_DELAY_NS, Command, Drive, Measurement
+from emulator.axis import Command, Measurement
+from emulator.drive import Drive
+from emulator.stops import BRAKE_DELAY_NS
 from protocols import cia402, emcy, nmt, sdo
 from protocols.cia402 import CONTROLWORD, Mode, State
 from protocols.sdo import Abort
@@ -96,10 +98,10 @@ def test_mode_is_displayed_after_a_moment(bench) -> None:
     assert bench.read_int(0x6061) == Mode.CST
 
 
-@pytest.mark.parametrize("mode", [-1, 1, 3, 6, 9, 11])
+@pytest.mark.parametrize("mode", [-1, 2, 5, 11])
 def test_unsupported_modes(bench, mode: int) -> None:
     assert bench.refused(0x6060, 0, mode, 1) is Abort.VALUE
-    assert bench.read_int(0x6502) == 0x280
+    assert bench.read_int(0x6502) == 0b11_1110_1101
 
 
 def test_without_a_mode_the_power_stage_stays_off(bench) -> None:
@@ -252,6 +254,43 @@ def test_quick_stop_that_releases_cannot_be_taken_back(bench) -> None:
     assert drive.state is State.QUICK_STOP_ACTIVE
 
 
+@pytest.mark.parametrize(("option", "milliseconds", "end"), [(1, 250, State.SWITCH_ON_DISABLED), (5, 250, None)])
+def test_quick_stop_on_the_slow_ramp(bench, option: int, milliseconds: int, end: State | None) -> None:
+    drive = moving(bench, option)
+    bench.control(0x02, Mode.CST)
+    bench.sync(milliseconds - 1)
+    assert drive.axis.reference.velocity > 0
+    bench.sync(2 + BRAKE_DELAY_NS // MS)
+    assert drive.axis.reference.velocity == 0
+    assert drive.state is (end or State.QUICK_STOP_ACTIVE)
+
+
+@pytest.mark.parametrize(
+    ("index", "word", "target"), [(0x605B, 0x06, State.READY_TO_SWITCH_ON), (0x605C, 0x07, State.SWITCHED_ON)]
+)
+def test_shutdown_and_disabling(bench, index: int, word: int, target: State) -> None:
+    bench.write(index, 0, 0, 2)
+    drive = moving(bench, 2)
+    bench.control(word, Mode.CST)
+    assert drive.state is target and drive.command().mode == 0
+    bench.control(0x0F, Mode.CST)
+    bench.write(index, 0, 1, 2)
+    bench.control(word, Mode.CST)
+    bench.sync(240)
+    assert drive.state is State.OPERATION_ENABLED and drive.command().mode == Mode.CSP
+    bench.sync(15 + BRAKE_DELAY_NS // MS)
+    assert drive.state is target and drive.command().mode == 0
+
+
+def test_a_ramp_of_disabling_gives_way_to_stronger_stops(bench) -> None:
+    drive = moving(bench, 2)
+    bench.control(0x07, Mode.CST)
+    bench.control(0x02, Mode.CST)
+    assert drive.state is State.QUICK_STOP_ACTIVE
+    bench.control(0x00, Mode.CST)
+    assert drive.state is State.SWITCH_ON_DISABLED and drive.command().mode == 0
+
+
 def test_quick_stop_that_coasts(bench) -> None:
     drive = moving(bench, 0)
     bench.control(0x02, Mode.CST)
@@ -259,8 +298,8 @@ def test_quick_stop_that_coasts(bench) -> None:
 
 
 def test_option_codes_are_checked(bench) -> None:
-    assert bench.refused(0x605A, 0, 1, 2) is Abort.VALUE
-    assert bench.refused(0x605E, 0, 6, 2) is Abort.VALUE
+    for index, value in ((0x605A, 3), (0x605B, 2), (0x605C, -1), (0x605D, 0), (0x605E, 6)):
+        assert bench.refused(index, 0, value, 2) is Abort.VALUE
     assert bench.refused(0x6085, 0, 0, 4) is Abort.TOO_LOW
 
 
@@ -336,6 +375,69 @@ def test_following_error(bench, emergencies) -> None:
     assert bench.statusword == 0x2208
     bench.control(0x80, Mode.CSP)
     assert bench.statusword == 0x0240
+
+
+def test_speed_limit_of_torque_modes(bench) -> None:
+    bench.write(0x6080, 0, 600, 4)  # 10 revolutions per second
+    bench.enable(Mode.CST)
+    for speed, torque, current in ((9, 100, 0.2), (11, 100, 0.0), (11, -100, -0.2), (-11, -100, 0.0)):
+        bench.measurement = Measurement(0, speed * 131_072, 0.0)
+        bench.target(torque=torque)
+        bench.sync()
+        assert bench.drive.command().target_current_A == pytest.approx(current)
+
+
+def test_torque_limits_of_each_direction(bench) -> None:
+    bench.write(0x60E0, 0, 100, 2)
+    bench.write(0x60E1, 0, 50, 2)
+    bench.enable(Mode.CST)
+    for torque, current in ((300, 0.2), (-300, -0.1), (70, 0.14)):
+        bench.target(torque=torque)
+        bench.sync()
+        assert bench.drive.command().target_current_A == pytest.approx(current)
+
+
+def test_current_limit_of_the_power_stage(bench) -> None:
+    assert bench.drive.changed_limit() == 8.0
+    assert bench.drive.changed_limit() is None
+    bench.write(0x6073, 0, 1500, 2)
+    assert bench.drive.changed_limit() == 3.0
+    bench.write(0x6073, 0, 60_000, 2)
+    bench.write(0x6072, 0, 60_000, 2)
+    assert bench.drive.changed_limit() == 8.0  # what the hardware can
+
+
+def test_software_position_limits(bench) -> None:
+    bench.write(0x607D, 1, -100, 4)
+    bench.write(0x607D, 2, 200, 4)
+    bench.enable(Mode.CSP)
+    for target, reached, status in ((150, 150, 0x1237), (201, 200, 0x1A37), (-300, -100, 0x1A37)):
+        bench.target(position=target)
+        bench.sync()
+        assert bench.drive.command().target_position == reached
+        assert bench.statusword == status
+    bench.write(0x607D, 1, 0, 4)
+    bench.write(0x607D, 2, 0, 4)  # off
+    bench.sync()
+    assert bench.drive.command().target_position == -300
+
+
+def test_interpolation_between_slow_targets(bench) -> None:
+    bench.write(0x60C2, 1, 4, 1)
+    bench.enable(Mode.CSP)
+    seen = []
+    for target in (40, 80):
+        bench.target(position=target)
+        for _ in range(4):
+            bench.sync()
+            seen.append(bench.drive.command().target_position)
+    assert seen == pytest.approx([10, 20, 30, 40, 50, 60, 70, 80])
+
+
+def test_current_in_milliamperes(bench) -> None:
+    bench.measurement = Measurement(0, 0, -0.123456)
+    bench.sync()
+    assert bench.read_int(0x2078, signed=True) == -123
 
 
 def test_following_error_can_be_switched_off(bench, emergencies) -> None:
