@@ -5,6 +5,9 @@ from numpy.typing import NDArray
 
 from emulator import current_loop
 from emulator.arm import Body, Power, State, advance_period
+from emulator.effects.build import initial, physics
+from emulator.effects.period import Memory, Physics, advance_with_effects
+from emulator.effects.present import present_in, true_gain, with_static
 from emulator.kernels import Floats, Ints
 from protocols.dictionary import current_loop_gains
 from protocols.errors import ConfigError
@@ -22,8 +25,9 @@ class Plant:
     Attributes:
         q, qd: Joint positions and speeds at the end of the last period, shape (J,) [rad, rad/s].
         current_gains: KR [V/A] and TN [s] of each axis, shape (J, 2).
-        motor_temperature_C: Windings, shape (J,).
-        ambient_C: Where the windings start and cool to.
+        motor_temperature_C: What the cell's sensors see, shape (J,): the windings; where friction depends on
+            temperature, the lubricant, with the sensor's lag.
+        ambient_C: Where temperatures start and go back to.
     """
 
     def __init__(
@@ -41,12 +45,16 @@ class Plant:
         """At rest at `start_rad`, by default the joint zero or the limit next to it.
 
         Args:
-            robot: The truth.
+            robot: The truth, with its effects.
             current_noise_A: Standard deviation of a period's mean current, shape (J,).
             encoder_noise_rad: Standard deviation of an encoder reading on the joint side, shape (J,).
             substep_Hz: At least this many substeps per second.
+
+        Raises:
+            ConfigError: An effect that this arm cannot have.
         """
         J = robot.joints
+        present = present_in(robot)
         self._robot = robot
         self._period_s = period_s
         self._substeps = max(1, int(np.ceil(period_s * substep_Hz - 1e-9)))
@@ -54,28 +62,25 @@ class Plant:
         self._rng = rng
         self._trace_rng = rng.spawn(1)[0]
         self.ambient_C = ambient_C
-        self._body = _body(robot)
-        self._power = _power(robot, period_s, self._substeps, current_noise_A, encoder_noise_rad)
+        self._body = _body(with_static(present))
+        power = _power(robot, period_s, self._substeps, current_noise_A, encoder_noise_rad)
+        self._power = power._replace(gain=true_gain(power.gain, present), emf=true_gain(power.emf, present))
         self.current_gains = np.array([current_loop_gains(joint.drive) for joint in robot.joint])
         for j in range(J):
             self.set_current_gains(j, *self.current_gains[j])
         low = np.array([joint.position_min_rad for joint in robot.joint])
         high = np.array([joint.position_max_rad for joint in robot.joint])
         q = np.clip(np.zeros(J), low, high) if start_rad is None else np.array(start_rad, dtype=float)
-        self._state = State(
-            q=q,
-            qd=np.zeros(J),
-            qdd=np.zeros(J),
-            impulse=np.zeros(len(self._body.dry_Nm)),
-            current_A=np.zeros(J),
-            integrator_V=np.zeros(J),
-            target=np.zeros(J),
-            following=np.zeros(J, dtype=np.int64),
-            mean_A=np.zeros(J),
-            counts=robot.motor_counts(q),
-            temperature_C=np.full(J, ambient_C),
-        )
-        self.q, self.qd, self.motor_temperature_C = self._state.q, self._state.qd, self._state.temperature_C
+        self._state = _at_rest(q, self._body, ambient_C)
+        self.motor_temperature_C = self._state.temperature_C
+        self._extended: tuple[Physics, Memory] | None = None
+        if present.is_dynamic:
+            extended = physics(present, self._body, period_s, self._substeps, q)
+            self._state, memory = initial(extended, self._power, q, self._substeps, ambient_C)
+            self._extended = extended, memory
+            self.motor_temperature_C = memory.warm.shown_C
+        self.q, self.qd = self._state.q, self._state.qd
+        self._state.counts[:] = robot.motor_counts(q)
         self._counts = np.rint(self._state.counts).astype(np.int64)
         self._before = self._counts
         self.keep_trace(wanted=False)
@@ -103,6 +108,13 @@ class Plant:
         """Saturation of the current loop's reference on axis j, in every mode."""
         self._power.max_A[j] = limit_A
 
+    def warm_to(self, temperature_C: Floats) -> None:
+        """Windings, lubricants and sensors of all axes as after long work, shape (J,)."""
+        self._state.temperature_C[:] = temperature_C
+        self.motor_temperature_C[:] = temperature_C
+        if self._extended is not None:
+            self._extended[1].warm.lubricant_C[:] = temperature_C
+
     def advance(self, mode: Ints, target_counts: Floats, target_current_A: Floats) -> None:
         """One sync period.
 
@@ -115,18 +127,13 @@ class Plant:
             ConfigError: The mass matrix is not positive definite: the robot file describes no physical arm.
         """
         draws = self._rng.standard_normal((self._substeps + 1, len(self.q)))
-        if not advance_period(
-            self._body,
-            self._power,
-            self._state,
-            mode,
-            target_counts,
-            target_current_A,
-            draws,
-            self.ambient_C,
-            self._h_s,
-            self._trace,
-        ):
+        aims = mode, target_counts, target_current_A, draws, self.ambient_C, self._h_s, self._trace
+        if self._extended is None:
+            sound = advance_period(self._body, self._power, self._state, *aims)
+        else:
+            constants, memory = self._extended
+            sound = advance_with_effects(constants, self._power, self._state, memory, *aims)
+        if not sound:
             raise ConfigError(
                 f"{self._robot.name}: the mass matrix is not positive definite at"
                 f" q = {np.array2string(self.q, precision=3)} rad. Use parameters that a physical arm can have."
@@ -153,6 +160,23 @@ class Plant:
         """Latched at the end of `advance`: encoder counts, counts/s (difference of two latches), mean current [A]."""
         velocity = np.rint((self._counts - self._before) / self._period_s).astype(np.int64)
         return self._counts, velocity, self._state.mean_A.copy()
+
+
+def _at_rest(q: Floats, body: Body, ambient_C: float) -> State:
+    J = len(q)
+    return State(
+        q=q,
+        qd=np.zeros(J),
+        qdd=np.zeros(J),
+        impulse=np.zeros(len(body.dry_Nm)),
+        current_A=np.zeros(J),
+        integrator_V=np.zeros(J),
+        target=np.zeros(J),
+        following=np.zeros(J, dtype=np.int64),
+        mean_A=np.zeros(J),
+        counts=np.zeros(J),
+        temperature_C=np.full(J, ambient_C),
+    )
 
 
 def _body(robot: Robot) -> Body:

@@ -216,11 +216,21 @@ def test_a_machine_with_other_joints() -> None:
         load_machine(named, robot)
 
 
+def test_effects_of_machine_and_rig_come_together_with_every_parameter() -> None:
+    rig, robot = load_rig("emps-rig")
+    spring = msgspec.structs.replace(robot, effect=[EffectEntry(effect="spring", joint="carriage")])
+    stribeck = EffectEntry(effect="friction.stribeck", joint="carriage", parameters={"stiction_Nm": 7.0})
+    machine = load_machine(msgspec.structs.replace(rig, emulated=Emulated(effect=[stribeck])), spring)
+    assert [entry.effect for entry in machine.effect] == ["spring", "friction.stribeck"]
+    assert machine.effect[1].parameters["stiction_Nm"] == 7.0
+    assert machine.effect[1].parameters["exponent"] == 1.0
+
+
 def test_an_effect_that_is_not_emulated() -> None:
     rig, robot = load_rig("emps-rig")
-    entry = EffectEntry(effect="friction.stribeck", joint="carriage")
-    with pytest.raises(ConfigError, match=r"EMPS rig: effect friction.stribeck@carriage cannot be emulated"):
+    entry = EffectEntry(effect="unlisted", joint="carriage")
+    with pytest.raises(ConfigError, match=r"EMPS rig: unlisted is what explain answers .* it cannot be emulated"):
         load_machine(msgspec.structs.replace(rig, emulated=Emulated(effect=[entry])), robot)
     spring = msgspec.structs.replace(robot, effect=[EffectEntry(effect="spring")])
-    with pytest.raises(ConfigError, match=r"effect spring cannot be emulated"):
+    with pytest.raises(ConfigError, match=r"EMPS rig: spring needs a joint: one of carriage\."):
         load_machine(rig, spring)
