@@ -20,6 +20,9 @@ import typer
 from protocols.errors import ArmrigError, ConfigError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from emulator.rig import EmulatedRig
     from protocols.messages import Attached, Logged, Method
     from protocols.motion import Motion
@@ -51,6 +54,7 @@ JsonOption = Annotated[
 Recordings = Annotated[list[str], typer.Argument(metavar="RUN.mcap...", help="Recordings.")]
 
 PIPE = ["-"]
+INTERRUPTED = 130  # what shells report of a process that Ctrl-C ended
 
 
 def main() -> None:
@@ -60,6 +64,8 @@ def main() -> None:
     except ArmrigError as error:
         print(f"armrig: {error}", file=sys.stderr)
         raise SystemExit(error.exit_code) from None
+    except KeyboardInterrupt:  # before a command had set up its own safe end
+        raise SystemExit(INTERRUPTED) from None
     except BrokenPipeError:  # whoever read our output has gone: nothing left to say
         raise SystemExit(0) from None
 
@@ -135,6 +141,13 @@ def emulated(rig: "Rig", robot: "Robot", rig_name: str, seed: int | None) -> "Em
     if seed is not None:
         rig = msgspec.structs.replace(rig, emulated=msgspec.structs.replace(rig.emulated, seed=seed))
     return EmulatedRig(rig, load_machine(rig, robot, locate(rig_name).parent))
+
+
+def idle(joints: int) -> "tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]":
+    """What a plant is told of drives that are off."""
+    import numpy as np
+
+    return np.zeros(joints, dtype=np.int64), np.zeros(joints), np.zeros(joints)
 
 
 def load_motion(name: str) -> "Motion":
@@ -218,6 +231,7 @@ def emulate_on_buses(rig_name: str, moved: Sequence[str], duration: float | None
     rig, robot = load(rig_name, moved)
     report_loads(rig)
     arm = emulated(rig, robot, rig_name, seed)
+    emulated(rig, robot, rig_name, seed).plant.advance(*idle(robot.joints))  # compiles, where nothing is cached yet
     with ExitStack() as stack:
         served = [(b.name, b.channel) for b in rig.bus if b.interface == "virtualcan"]
         channels = stack.enter_context(HubProcess(served)).channels if served else {}
@@ -257,6 +271,7 @@ def move(
     with ExitStack() as stack:
         buses = [stack.enter_context(open_bus(b)) for b in cell.bus]
         stop = stack.enter_context(stopping())
+        log(f"moving {cell.name}: {motion}")
         if not real_time():
             log("real-time priority is not allowed here; cycles may be late")
         print(run(host, buses, RealClock(), stop, cell.sync_period_us * 1000))
