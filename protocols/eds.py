@@ -1,6 +1,5 @@
 """Electronic data sheet of a dictionary (CiA 306-1): what configuration tools and masters read."""
 
-import struct
 from collections.abc import Iterable, Iterator
 
 from protocols.dictionary import PDOS, PRODUCT, REVISION, VENDOR
@@ -8,6 +7,11 @@ from protocols.objects import Code, Dictionary, Entry, Object, Type
 
 _MANDATORY = (0x1000, 0x1001, 0x1018)
 _BIT_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)  # kbit/s
+
+
+# A domain has no value. A REAL32's is left to SDO: CiA 306-1 writes its bits, which gocanopen refuses the whole sheet
+# for, and canopen reads decimals.
+_WITHOUT_VALUES = (Type.DOMAIN, Type.REAL32)
 
 
 def eds(dictionary: Dictionary, file_name: str = "drive.eds") -> str:
@@ -81,12 +85,13 @@ def _entry(entry: Entry) -> dict[str, str]:
         "DataType": f"0x{entry.type:04X}",
         "AccessType": entry.access,
     }
-    if entry.type is not Type.DOMAIN:
+    valued = entry.type not in _WITHOUT_VALUES
+    if valued:
         keys["DefaultValue"] = ("$NODEID+" if entry.node_relative else "") + _value(entry, entry.default)
     keys["PDOMapping"] = str(int(entry.mappable))
-    if entry.low is not None:
+    if valued and entry.low is not None:
         keys["LowLimit"] = _value(entry, entry.low)
-    if entry.high is not None:
+    if valued and entry.high is not None:
         keys["HighLimit"] = _value(entry, entry.high)
     return keys
 
@@ -94,6 +99,4 @@ def _entry(entry: Entry) -> dict[str, str]:
 def _value(entry: Entry, value: int | float | str) -> str:
     if isinstance(value, str):
         return value
-    if entry.type is Type.REAL32:  # CiA 306-1, 4.6.3.3: the bits of the IEEE 754 number
-        return f"0x{struct.unpack('<I', struct.pack('<f', value))[0]:08X}"
     return f"0x{value:X}" if value >= 0 and entry.name.startswith("COB-ID") else str(int(value))
