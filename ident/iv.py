@@ -12,62 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ident import auxiliary
-from ident.auxiliary import Run
-from ident.contract import Iterate
 from ident.covariance import HAC, Covariance, Moments
-from ident.dataset import prepare
 from ident.estimate import Estimate, assemble, joint_rows, refuse_deficient
 from ident.hausman import hausman
-from ident.model import Model
+from ident.iteration import PAPER, Criterion, Outcome, Step, iterate
 from ident.observation import Observation
 from ident.problem import Problem
-from ident.system import Solution, System, triangle
-from protocols.errors import IdentificationError
+from ident.system import System, triangle
 
 Array = NDArray[np.float64]
 
 SHOWN = 1e-5  # singular value, columns scaled to 1, from which on the rows of one joint show a combination
 ROUNDING = 1e-6  # share of the largest column: smaller ones are zero but for differences of rounded positions
-
-
-@dataclass(frozen=True)
-class Criterion:
-    """When an iteration has converged, eq. (27).
-
-    A parameter has settled when it changes by less than `parameters` of its value or less than `deviations` of its
-    standard deviation: one that the motion hardly shows never settles relatively to itself.
-
-    Attributes:
-        residual: tol1, relative change of the residual's norm.
-        parameters: tol2, relative change of every parameter.
-        deviations: Change in standard deviations that the data cannot tell.
-        iterations: Most.
-    """
-
-    residual: float = 0.025
-    parameters: float = 0.025
-    deviations: float = 0.5
-    iterations: int = 10
-
-    def change(self, beta: Array, before: Array, std: Array) -> Array:
-        """Of every parameter, in units of what is allowed, shape (b,)."""
-        allowed = np.maximum(self.parameters * np.abs(before), self.deviations * std)
-        return np.asarray(np.abs(beta - before) / np.maximum(allowed, np.finfo(float).tiny))
-
-    def met(self, change: Array, norm: float, norm_before: float) -> bool:
-        """Both parts; the first iteration has nothing to compare its residual with."""
-        return bool(change.max() <= 1 and abs(norm - norm_before) <= self.residual * norm_before)
-
-    def complaint(self, method: str, names: Sequence[str], change: Array) -> str:
-        """Note of an iteration that was stopped."""
-        worst = int(np.argmax(change))
-        return (
-            f"{method} has not converged after {self.iterations} iterations: {names[worst]} still changes by"
-            f" {change[worst]:.2g} times the {100 * self.parameters:g} % (or {self.deviations:g} standard deviations)"
-            " that are allowed. Record a motion that shows it better, or check the robot file's drive gains and control"
-            " law."
-        )
 
 
 @dataclass(frozen=True)
@@ -81,7 +37,7 @@ class IdimIv:
     """
 
     covariance: Covariance = HAC
-    criterion: Criterion = Criterion()
+    criterion: Criterion = PAPER
     update_gains: bool = True
     name: str = "IDIM-IV"
 
@@ -94,73 +50,33 @@ class IdimIv:
             IdentificationError: The motion does not show some base parameters, or the auxiliary model cannot be
                 simulated at some iteration; says which and what to do.
         """
-        model, base, criterion = problem.model, problem.base, self.criterion
-        runs = auxiliary.runs(problem.signals)
-        beta = base.B @ regular_start(model)
-        norm, change, converged = float("inf"), np.full(len(beta), np.inf), False
-        sound, history, k = beta, [], 0
-        while k < criterion.iterations and not converged:
-            instruments, sound, error = self._instruments(problem, runs, beta, sound, k)
-            history.append(Iterate(beta.tolist(), error.tolist(), norm if k else None))
-            system, sigma = weighted_system(problem.observations, instruments)
-            refuse_deficient(system.instruments, base, instruments)
-            solution = system.solve()
-            change = criterion.change(solution.beta, beta, solution.std)
-            now = residual_norm(problem.observations, solution.beta)
-            converged = criterion.met(change, now, norm)
-            beta, norm, k = solution.beta, now, k + 1
-        final, simulated, error = self._instruments(problem, runs, beta, sound, k)
-        history.append(Iterate(beta.tolist(), error.tolist(), norm))
-        notes = [] if converged else [criterion.complaint(self.name, base.names, change)]
-        if not np.array_equal(simulated, beta):
-            notes.append(
-                f"{self.name}: the estimate itself cannot be simulated (its mass matrix is not positive definite on this"
-                " motion); the auxiliary model had parameters near it."
-            )
-        moments = _moments(problem.observations, instruments, system, solution, sigma)
+        refuse_deficient(triangle(problem.triangles)[:, :-1], problem.base, problem.observations)
+
+        def solve(columns: list[Observation]) -> Step:
+            system, sigma = weighted_system(problem.observations, columns)
+            refuse_deficient(system.instruments, problem.base, columns)
+            return Step(problem.observations, system, sigma)
+
+        found = iterate(problem, self.name, solve, self.criterion, update_gains=self.update_gains)
+        moments = _moments(problem.observations, found)
         covariance, words = self.covariance.of(moments)
         return assemble(
             problem.observations,
-            base,
+            problem.base,
             self.name,
-            beta,
+            found.beta,
             covariance=covariance,
             covariance_name=words,
             white=moments.white,
-            sigma_Nm=sigma,
-            system=system,
+            sigma_Nm=found.step.sigma,
+            system=found.step.system,
             triangles=problem.triangles,
-            notes=notes,
-            iterations=k,
-            converged=converged,
-            history=history,
-            tests=[hausman(problem.observations, final, sigma)],
+            notes=found.notes,
+            iterations=found.iterations,
+            converged=found.converged,
+            history=found.history,
+            tests=[hausman(problem.observations, found.final, found.step.sigma)],
         )
-
-    def _instruments(
-        self, problem: Problem, runs: Sequence[Run], beta: Array, sound: Array, k: int
-    ) -> tuple[list[Observation], Array, Array]:
-        """Columns of the arm simulated at beta or near it, the parameters it had, and its position errors."""
-        try:
-            simulated, used = auxiliary.simulate_near(
-                runs, problem.model, problem.base, beta, sound, update_gains=self.update_gains
-            )
-        except IdentificationError as error:
-            raise IdentificationError(f"{self.name}, iteration {k}: {error}") from error
-        columns = [
-            problem.observe(prepare(auxiliary.as_signals(run, stretches), dataset.filter_Hz))
-            for run, stretches, dataset in zip(runs, simulated, problem.datasets, strict=True)
-        ]
-        return columns, used, auxiliary.position_error_percent(runs, simulated)
-
-
-def regular_start(model: Model) -> Array:
-    """Standard parameters of the regular initialisation (24), shape (P,): every motor's rotor is 1, all else 0. Where
-    motor 6 turns with joint 5, this gives the paper's Ia5 = 2."""
-    diagonal = (model.coupling**2).sum(axis=0)
-    values = {f"Ia{j + 1}": float(value) for j, value in enumerate(diagonal)}
-    values |= {f"ia_m{k + 1}": 1.0 for k in model.coupled}
-    return np.array([values.get(name, 0.0) for name in model.names])
 
 
 def weighted_system(observations: Sequence[Observation], instruments: Sequence[Observation]) -> tuple[System, Array]:
@@ -181,11 +97,6 @@ def weighted_system(observations: Sequence[Observation], instruments: Sequence[O
     return System.of_instruments(whole, b), sigma
 
 
-def residual_norm(observations: Sequence[Observation], beta: Array) -> float:
-    """||Y - W beta|| over all rows used, not weighted [N·m]."""
-    return float(np.sqrt(sum(np.sum(np.where(o.used, o.y - o.predict(beta), 0.0) ** 2) for o in observations)))
-
-
 def _joint_sigma(block: Array, b: int, rows: int) -> float:
     """Standard deviation of one joint's error by instrumental variables on its own rows; parameters that they do not
     show are left out."""
@@ -204,17 +115,12 @@ def _joint_sigma(block: Array, b: int, rows: int) -> float:
     return max(sigma, float(np.finfo(float).tiny))
 
 
-def _moments(
-    observations: Sequence[Observation],
-    instruments: Sequence[Observation],
-    system: System,
-    solution: Solution,
-    sigma: Array,
-) -> Moments:
+def _moments(observations: Sequence[Observation], found: Outcome) -> Moments:
     """What any covariance needs: an error e moves the estimate by inv(Z' W) Z' e (weighted)."""
+    system = found.step.system
     bread = np.asarray(np.linalg.inv(system.instruments.T @ system.W), dtype=np.float64)
     G = [
-        np.where(o.used[:, :, None], z.W, 0.0) / sigma[:, None, None] ** 2
-        for o, z in zip(observations, instruments, strict=True)
+        np.where(o.used[:, :, None], z.W, 0.0) / found.step.sigma[:, None, None] ** 2
+        for o, z in zip(observations, found.columns, strict=True)
     ]
-    return Moments(observations, solution.beta, bread, G, solution.inverse @ solution.inverse.T)
+    return Moments(observations, found.beta, bread, G, found.solution.inverse @ found.solution.inverse.T)
