@@ -3,14 +3,15 @@
 import errno
 import logging
 import select
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Self
 
 import can
 
 from emulator.virtualcan import VirtualCanBus
 from protocols.clock import Clock, RealClock
-from protocols.frames import Frame
+from protocols.errorframes import Class, Status
+from protocols.frames import ERROR, Frame
 from protocols.pythoncan import cannot_open, from_message, lost, to_message
 from protocols.rig import Bus
 
@@ -29,12 +30,17 @@ class FrameBus:
 
     Virtualcan goes a batch at a time, every other interface of python-can a message at a time.
 
+    Args:
+        nodes: Devices that this process stands for. On a hub with a wire each is a controller of its own, told by the
+            identifier's last seven bits (CiA 301, table 39); what goes under none of their identifiers is the first's.
+
     Attributes:
         dropped: Frames given up because the transmit queue stayed full.
     """
 
-    def __init__(self, bus: Bus, opened: can.BusABC, clock: Clock) -> None:
+    def __init__(self, bus: Bus, opened: can.BusABC, clock: Clock, nodes: Collection[int] = ()) -> None:
         self.name = bus.name
+        self._stations = {n: n if n in nodes else min(nodes) for n in range(128)} if nodes else None
         self.dropped = 0
         self._config = bus
         self._bus = opened
@@ -50,7 +56,10 @@ class FrameBus:
         """
         try:
             if self._hub is not None:
-                self._hub.write_frames(frames)
+                if self._stations is None:
+                    self._hub.write_frames(frames)
+                else:
+                    self._hub.write_frames(frames, [self._stations[f.can_id & 0x7F] for f in frames])
             else:
                 for frame in frames:
                     self._send_one(frame)
@@ -92,13 +101,15 @@ class FrameBus:
         """
         try:
             if self._hub is not None:
-                return self._hub.read_frames(0)
-            frames: list[Frame] = []
-            while len(frames) < MAX_BATCH and (message := self._bus.recv(0)) is not None:
-                frames.append(from_message(message))
-            return frames
+                frames = self._hub.read_frames(0)
+            else:
+                frames = []
+                while len(frames) < MAX_BATCH and (message := self._bus.recv(0)) is not None:
+                    frames.append(from_message(message))
         except (can.CanError, OSError) as error:
             raise lost(self._config, error) from error
+        self.dropped += sum([_is_overflow(f) for f in frames])
+        return frames
 
     @property
     def blind(self) -> bool:
@@ -124,20 +135,29 @@ class FrameBus:
         self.close()
 
 
+def _is_overflow(frame: Frame) -> bool:
+    """Whether a controller reports that its transmit queue was full."""
+    report = ERROR | Class.CONTROLLER
+    return frame.can_id & report == report and bool(frame.data[1:2]) and bool(frame.data[1] & Status.TX_OVERFLOW)
+
+
 def _queue_is_full(error: can.CanOperationError) -> bool:
     # python-can says it in words when select() finds the socket not writable.
     return error.error_code == errno.ENOBUFS or "Transmit buffer full" in str(error)
 
 
-def open_bus(bus: Bus) -> FrameBus:
+def open_bus(bus: Bus, nodes: Collection[int] = ()) -> FrameBus:
     """Join a bus of a rig.
+
+    Args:
+        nodes: As `FrameBus`.
 
     Raises:
         PeerError: It does not exist, nobody serves it, or python-can has no such interface; says what to do.
     """
     try:
         if bus.interface == "virtualcan":
-            return FrameBus(bus, VirtualCanBus(bus.channel), RealClock())
+            return FrameBus(bus, VirtualCanBus(bus.channel), RealClock(), nodes)
         opened = can.Bus(bus.channel, bus.interface, ignore_config=True, bitrate=bus.bitrate)
     except (can.CanError, NotImplementedError, OSError, ValueError) as error:
         raise cannot_open(bus, error) from error

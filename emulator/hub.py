@@ -1,7 +1,8 @@
 """CAN hub: every client of a bus hears what every other client of that bus says, in one order for all.
 
-For machines without SocketCAN. It forwards whole virtualcan records (`protocols.frames`) without decoding them: what
-arrives in one read leaves in one write per client. It is a wire without arbitration, bit timing or errors.
+For machines without SocketCAN. Left to itself it is an ideal wire: whole virtualcan records (`protocols.frames`) pass
+undecoded, what arrives in one read leaves in one write per client. With an `emulator.wire.Wire` in it, a bus has
+arbitration, bit timing and errors.
 """
 
 import contextlib
@@ -12,12 +13,17 @@ import selectors
 import signal
 import socket
 import stat
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Self
 
 from emulator.channel import Channel, parse
+from emulator.disturbance import Disturbance
+from emulator.timedbus import Parcel, TimedBus
+from emulator.wire import Traffic, Wire
+from protocols.clock import RealClock
 from protocols.errors import PeerError
 from protocols.frames import MAX_DATA, WIRE_BYTES
 
@@ -49,6 +55,7 @@ class _Bus:
     name: str
     listener: socket.socket
     channel: Channel
+    timed: TimedBus | None = None
     clients: "dict[_Client, None]" = field(default_factory=dict)  # ordered set
     frames: int = 0
     expelled: int = 0
@@ -78,22 +85,28 @@ class Hub:
 
     Args:
         buses: Pairs (name, channel); port 0 picks a free one, see `channels`.
+        wires: By name, for the buses that are not ideal.
 
     Raises:
         ConfigError: A channel is no address.
         PeerError: A channel cannot be listened on.
     """
 
-    def __init__(self, buses: Sequence[tuple[str, str]]) -> None:
-        self._selector = selectors.DefaultSelector()
+    def __init__(self, buses: Sequence[tuple[str, str]], wires: Mapping[str, Wire] | None = None) -> None:
+        # epoll waits in whole milliseconds, select in microseconds; a frame takes a tenth of a millisecond.
+        self._selector = selectors.SelectSelector() if wires else selectors.DefaultSelector()
+        self._stopping = False
+        self._disturbances: deque[Disturbance] = deque()
         self._wake_in, self._wake_out = socket.socketpair()
         self._wake_in.setblocking(False)
         self._selector.register(self._wake_out, selectors.EVENT_READ, None)
         self._buses: list[_Bus] = []
+        clock = RealClock()
         try:
             for name, channel in buses:
                 listener = _listen(name, parse(channel))
-                bus = _Bus(name, listener, _bound(listener))
+                wire = (wires or {}).get(name)
+                bus = _Bus(name, listener, _bound(listener), None if wire is None else TimedBus(wire, clock))
                 self._buses.append(bus)
                 self._selector.register(listener, selectors.EVENT_READ, bus)
         except BaseException:
@@ -110,22 +123,41 @@ class Hub:
         """Traffic of each bus so far."""
         return {bus.name: BusCounts(bus.frames, len(bus.clients), bus.expelled) for bus in self._buses}
 
+    @property
+    def traffic(self) -> dict[str, Traffic]:
+        """What each bus with a wire has carried."""
+        return {bus.name: bus.timed.traffic for bus in self._buses if bus.timed is not None}
+
     def run(self) -> None:
         """Forward until `stop`."""
-        while True:
-            for key, events in self._selector.select():
+        timed = [(bus, bus.timed) for bus in self._buses if bus.timed is not None]
+        wait_s = None
+        while not self._stopping:
+            for key, events in self._selector.select(wait_s):
                 if key.data is None:
-                    return
-                if isinstance(key.data, _Bus):
+                    self._obey()
+                elif isinstance(key.data, _Bus):
                     self._accept(key.data)
                 else:
                     if events & selectors.EVENT_WRITE:
                         self._drain(key.data)
                     if events & selectors.EVENT_READ:
                         self._read(key.data)
+            for bus, wire in timed:
+                self._deliver(bus, wire.due())
+            wait_s = min([wire.wait_s() for _, wire in timed], default=None)
 
     def stop(self) -> None:
         """End `run`; for signal handlers and other threads."""
+        self._stopping = True
+        self._wake()
+
+    def disturb(self, disturbance: Disturbance) -> None:
+        """From now on this goes wrong, too; for other threads. Nothing happens on an ideal bus."""
+        self._disturbances.append(disturbance)
+        self._wake()
+
+    def _wake(self) -> None:
         with contextlib.suppress(OSError):  # already stopping, or closed
             self._wake_in.send(b"\0")
 
@@ -148,6 +180,25 @@ class Hub:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def _obey(self) -> None:
+        self._wake_out.recv(READ_BYTES)
+        while self._disturbances:
+            disturbance = self._disturbances.popleft()
+            for bus in self._buses:
+                if bus.name == disturbance.bus and bus.timed is not None:
+                    bus.timed.disturb(disturbance)
+
+    def _deliver(self, bus: _Bus, parcels: Sequence[Parcel]) -> None:
+        if not parcels:
+            return
+        for client in list(bus.clients):
+            hears = bus.timed is None or bus.timed.hears(client)
+            records = b"".join(
+                [r for r, but, to in parcels if to is client or (to is None and hears and client not in but)]
+            )
+            if records and client in bus.clients:
+                self._send(client, records)
+
     def _accept(self, bus: _Bus) -> None:
         try:
             sock, _ = bus.listener.accept()
@@ -159,6 +210,8 @@ class Hub:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client = _Client(bus, sock)
         bus.clients[client] = None
+        if bus.timed is not None:
+            bus.timed.join(client)
         self._selector.register(sock, selectors.EVENT_READ, client)
 
     def _read(self, client: _Client) -> None:
@@ -183,6 +236,9 @@ class Hub:
             self._expel(client, "its bytes are not virtualcan records (length 14, DLC at most 8)")
             return
         client.bus.frames += whole // WIRE_BYTES
+        if client.bus.timed is not None:
+            self._deliver(client.bus, client.bus.timed.offer(client, records))
+            return
         for other in [c for c in client.bus.clients if c is not client]:
             self._send(other, records)
 
@@ -224,6 +280,8 @@ class Hub:
 
     def _forget(self, client: _Client) -> None:
         del client.bus.clients[client]
+        if client.bus.timed is not None:
+            client.bus.timed.leave(client)
         self._selector.unregister(client.sock)
         client.sock.close()
 
@@ -272,17 +330,21 @@ def _bound(listener: socket.socket) -> Channel:
     return Channel(listener.family, address if isinstance(address, str) else (address[0], address[1]))
 
 
-def serve(buses: Sequence[tuple[str, str]], ready: Callable[[dict[str, str]], None] | None = None) -> None:
+def serve(
+    buses: Sequence[tuple[str, str]],
+    ready: Callable[[dict[str, str]], None] | None = None,
+    wires: Mapping[str, Wire] | None = None,
+) -> None:
     """Run a hub in the main thread of a process until SIGTERM or SIGINT.
 
     Args:
-        buses: As `Hub`.
+        buses, wires: As `Hub`.
         ready: Called with the bound channels once clients can connect.
 
     Raises:
         ConfigError, PeerError: As `Hub`.
     """
-    with Hub(buses) as hub:
+    with Hub(buses, wires) as hub:
 
         def stop(_signal: int, _frame: FrameType | None) -> None:
             hub.stop()

@@ -4,7 +4,8 @@ import select
 import socket
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import repeat
 
 import can
 from can.typechecking import CanFilters
@@ -78,13 +79,16 @@ class VirtualCanBus(can.BusABC):
         except ValueError as error:
             raise can.CanOperationError(f"what answers at {self.channel} is not a CAN hub: {error}.") from error
 
-    def write_frames(self, frames: Sequence[Frame]) -> None:
+    def write_frames(self, frames: Sequence[Frame], stations: Iterable[int] = repeat(0)) -> None:
         """Send a burst with one system call; returns when all of it is under way.
+
+        Args:
+            stations: For each frame the controller that sends it, for a client that stands for several.
 
         Raises:
             CanOperationError: The hub is gone or does not read.
         """
-        data = memoryview(encode(frames))
+        data = memoryview(encode(frames, stations))
         with self._write_lock:
             while data:
                 try:

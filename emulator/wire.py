@@ -63,15 +63,31 @@ class Traffic(NamedTuple):
 
 
 class _Controller:
+    """A station's controller.
+
+    Attributes:
+        queue: Frames to send, with the time from which on and their rank in arbitration.
+        ready_ns: When the first of them may start; `NEVER_NS` without.
+        suspended_ns: Until when an error passive controller gives way.
+        repeats: Whether the first frame has gone through already, unnoticed.
+    """
+
     def __init__(self, station: Hashable, number: int) -> None:
         self.station = station
-        self.queue: deque[tuple[int, int, Frame]] = deque()  # ready [ns], arbitration rank, frame
-        self.confinement = Confinement(number)
+        self.queue: deque[tuple[int, int, Frame]] = deque()
+        self.ready_ns = NEVER_NS
         self.suspended_ns = 0
+        self.repeats = False
         self.restart_ns = NEVER_NS
+        self.confinement = Confinement(number)
 
-    def ready_ns(self) -> int:
-        return max(self.queue[0][0], self.suspended_ns)
+    def look(self) -> None:
+        """The head of the queue has changed."""
+        self.ready_ns = max(self.queue[0][0], self.suspended_ns) if self.queue else NEVER_NS
+
+    @property
+    def off(self) -> bool:
+        return self.confinement.state is State.BUS_OFF
 
 
 class _Transmission(NamedTuple):
@@ -110,7 +126,8 @@ class Wire:
         self._alone = False  # the one controller here waits, error passive, for somebody to acknowledge
         self._troubled = False  # some counter is not 0
         self._timer_ns = NEVER_NS  # earliest restart or bus-off to come
-        self._late: list[Disturbance] = []
+        self._taking_off: list[Disturbance] = []
+        self._holding_up: list[Disturbance] = []
         self._striking: dict[Kind, list[Disturbance]] = {}
         self._frames = self._errors = self._lost = self._dropped = self._busy_ns = 0
         for disturbance in disturbances:
@@ -134,7 +151,7 @@ class Wire:
 
     def hears(self, station: Hashable) -> bool:
         """Whether a station is on the bus at present."""
-        return self._controllers[station].confinement.state is not State.BUS_OFF
+        return not self._controllers[station].off
 
     def state(self, station: Hashable) -> Confinement:
         """Error counters and state of a station."""
@@ -143,8 +160,10 @@ class Wire:
     def disturb(self, disturbance: Disturbance) -> None:
         """From now on this goes wrong, too."""
         if disturbance.kind is Kind.BUS_OFF:
-            self._late.append(disturbance)
+            self._taking_off.append(disturbance)
             self._set_timer()
+        elif disturbance.kind in {Kind.DELAY, Kind.JITTER}:
+            self._holding_up.append(disturbance)
         else:
             self._striking.setdefault(disturbance.kind, []).append(disturbance)
 
@@ -166,7 +185,7 @@ class Wire:
         """
         controller = self._controllers[station]
         queue = controller.queue
-        if controller.confinement.state is State.BUS_OFF:
+        if controller.off:
             self._lost += 1
             return None
         if len(queue) >= self._queue_frames:
@@ -174,19 +193,19 @@ class Wire:
             full = encode(Class.CONTROLLER, Status.TX_OVERFLOW, station=controller.confinement.number)
             return Heard(t_ns, full, (), station)
         ready_ns = t_ns
-        for kind in (Kind.DELAY, Kind.JITTER):
-            for disturbance in self._striking.get(kind, ()):
-                if disturbance.strikes(t_ns, frame.can_id):
-                    ready_ns += disturbance.lateness_ns()
+        for disturbance in self._holding_up:
+            if disturbance.strikes(t_ns, frame.can_id):
+                ready_ns += disturbance.lateness_ns()
         queue.append((ready_ns, priority(frame.can_id), frame))
+        if len(queue) == 1:
+            controller.look()
         return None
 
     @property
     def next_ns(self) -> int:
         """When something happens next; `NEVER_NS` while the bus is idle."""
-        if self._on_wire is not None:
-            return min(self._on_wire.end_ns, self._timer_ns)
-        return min(self._next_start_ns(), self._timer_ns)
+        due_ns = self._on_wire.end_ns if self._on_wire is not None else self._next_start_ns()
+        return due_ns if due_ns < self._timer_ns else self._timer_ns
 
     def advance(self, t_ns: int) -> list[Heard]:
         """All that hosts get to know by `t_ns`, in order."""
@@ -208,40 +227,38 @@ class Wire:
     def _next_start_ns(self) -> int:
         if self._alone:
             return NEVER_NS
-        ready_ns = min([c.ready_ns() for c in self._controllers.values() if c.queue], default=NEVER_NS)
-        return max(self._free_ns, ready_ns)
+        ready_ns = min([c.ready_ns for c in self._controllers.values()], default=NEVER_NS)
+        return ready_ns if ready_ns > self._free_ns else self._free_ns
 
     def _begin(self, t_ns: int) -> None:
         """Arbitration, and the fate of what wins it."""
-        contenders = [c for c in self._controllers.values() if c.queue and c.ready_ns() <= t_ns]
-        rank = min(c.queue[0][1] for c in contenders)
-        senders = [c for c in contenders if c.queue[0][1] == rank]
+        rank, senders = NEVER_NS, []
+        for controller in self._controllers.values():
+            if controller.ready_ns <= t_ns:
+                own = controller.queue[0][1]
+                if own < rank:
+                    rank, senders = own, [controller]
+                elif own == rank:
+                    senders.append(controller)
         frame = senders[0].queue[0][2]
         bits = bit_length(frame)
         error = self._fate(t_ns, senders, frame)
-        if error is None:
-            total = bits
-            end_bits = bits - INTERMISSION_BITS
-        else:
-            at = bits - _AFTER_ACK_BITS
+        if error is not None:
+            end = bits - _AFTER_ACK_BITS
             if error is not Class.NO_ACK:
-                at = self._random.randint(_EARLIEST_ERROR_BIT, at)
-            total = at + _ERROR_BITS
-            end_bits = total - INTERMISSION_BITS
-        self._free_ns = t_ns + self._ns(total)
+                end = self._random.randint(_EARLIEST_ERROR_BIT, end)
+            bits = end + _ERROR_BITS
+        self._free_ns = t_ns + self._ns(bits)
         self._busy_ns += self._free_ns - t_ns
-        self._on_wire = _Transmission(t_ns + self._ns(end_bits), senders, frame, error)
+        self._on_wire = _Transmission(t_ns + self._ns(bits - INTERMISSION_BITS), senders, frame, error)
 
     def _fate(self, t_ns: int, senders: list[_Controller], frame: Frame) -> Class | None:
-        if any(c.queue[0][2] != frame for c in senders):
+        if len(senders) > 1 and any(c.queue[0][2] != frame for c in senders):
             return Class.PROTOCOL  # two stations under one identifier: their bits differ sooner or later
         for disturbance in self._striking.get(Kind.CORRUPT, ()):
             if disturbance.strikes(t_ns, frame.can_id):
                 return Class.PROTOCOL
-        sending = len(senders)
-        if sending == 1 and not any(
-            c is not senders[0] and c.confinement.state is not State.BUS_OFF for c in self._controllers.values()
-        ):
+        if all(c is senders[0] or c.off for c in self._controllers.values()):
             return Class.NO_ACK
         return None
 
@@ -251,26 +268,21 @@ class Wire:
             self._end_in_error(sent, heard)
             return
         self._frames += 1
-        times = 1
-        for controller in sent.senders:
-            if controller.queue:  # not one that was taken off meanwhile
-                controller.queue.popleft()
         if self._troubled:
             self._count_success(sent, heard)
-        for disturbance in self._striking.get(Kind.DUPLICATE, ()):
-            times += disturbance.strikes(sent.end_ns, sent.frame.can_id)
-        for disturbance in self._striking.get(Kind.DROP, ()):
-            if disturbance.strikes(sent.end_ns, sent.frame.can_id):
-                self._dropped += 1
-                return
-        senders = tuple([c.station for c in sent.senders])
-        heard.append(Heard(sent.end_ns, sent.frame, senders))
-        for _ in range(1, times):  # repeated at once, and heard as often
-            extra_ns = self._ns(bit_length(sent.frame))
-            heard.append(Heard(self._free_ns + extra_ns - self._ns(INTERMISSION_BITS), sent.frame, senders))
-            self._frames += 1
-            self._busy_ns += extra_ns
-            self._free_ns += extra_ns
+        repeated = not sent.senders[0].repeats and self._strikes(Kind.DUPLICATE, sent)
+        for controller in sent.senders:
+            controller.repeats = repeated
+            if controller.queue and not repeated:  # not one that was taken off meanwhile
+                controller.queue.popleft()
+                controller.look()
+        if self._strikes(Kind.DROP, sent):
+            self._dropped += 1
+        else:
+            heard.append(Heard(sent.end_ns, sent.frame, tuple([c.station for c in sent.senders])))
+
+    def _strikes(self, kind: Kind, sent: _Transmission) -> bool:
+        return any([d.strikes(sent.end_ns, sent.frame.can_id) for d in self._striking.get(kind, ())])
 
     def _end_in_error(self, sent: _Transmission, heard: list[Heard]) -> None:
         self._errors += 1
@@ -282,32 +294,36 @@ class Wire:
                 heard.append(self._tell(sent.end_ns, controller, encode(Class.NO_ACK)))
             self._note(sent, controller, controller.confinement.failed_to_send(unacknowledged=unacknowledged), heard)
             if controller.confinement.state is State.PASSIVE:
-                controller.suspended_ns = self._free_ns + self._ns(_SUSPEND_BITS)
+                self._suspend(controller)
                 self._alone |= unacknowledged
         for controller in self._controllers.values():
-            if controller not in sent.senders and controller.confinement.state is not State.BUS_OFF:
+            if controller not in sent.senders and not controller.off:
                 self._note(sent, controller, controller.confinement.failed_to_receive(), heard)
 
     def _count_success(self, sent: _Transmission, heard: list[Heard]) -> None:
         self._troubled = False
         for controller in self._controllers.values():
             confinement = controller.confinement
-            if confinement.state is State.BUS_OFF:
+            if controller.off:
                 continue
             if controller in sent.senders:
                 self._note(sent, controller, confinement.sent(), heard)
                 if confinement.state is State.PASSIVE:
-                    controller.suspended_ns = self._free_ns + self._ns(_SUSPEND_BITS)
+                    self._suspend(controller)
             else:
                 self._note(sent, controller, confinement.received(), heard)
             self._troubled |= bool(confinement.tec or confinement.rec)
+
+    def _suspend(self, controller: _Controller) -> None:
+        controller.suspended_ns = self._free_ns + self._ns(_SUSPEND_BITS)
+        controller.look()
 
     def _note(self, sent: _Transmission, controller: _Controller, report: Frame | None, heard: list[Heard]) -> None:
         """Pass on what a controller reports, and take it off the bus if that is what it says."""
         if report is None:
             return
         heard.append(self._tell(sent.end_ns, controller, report))
-        if controller.confinement.state is State.BUS_OFF:
+        if controller.off:
             self._take_off(sent.end_ns, controller, self._restart_ns)
 
     def _tell(self, t_ns: int, controller: _Controller, report: Frame) -> Heard:
@@ -316,6 +332,7 @@ class Wire:
     def _take_off(self, t_ns: int, controller: _Controller, restart_ns: int) -> None:
         self._lost += len(controller.queue)
         controller.queue.clear()
+        controller.look()
         controller.restart_ns = min(t_ns + restart_ns, NEVER_NS)
         self._set_timer()
 
@@ -325,11 +342,11 @@ class Wire:
                 controller.restart_ns = NEVER_NS
                 heard.append(self._tell(t_ns, controller, controller.confinement.restart()))
                 self._resume(t_ns)
-        for disturbance in [d for d in self._late if d.begin_ns <= t_ns]:
-            self._late.remove(disturbance)
+        for disturbance in [d for d in self._taking_off if d.begin_ns <= t_ns]:
+            self._taking_off.remove(disturbance)
             for controller in self._controllers.values():
                 confinement = controller.confinement
-                if disturbance.node in {None, confinement.number} and confinement.state is not State.BUS_OFF:
+                if disturbance.node in {None, confinement.number} and not controller.off:
                     heard.append(self._tell(t_ns, controller, confinement.bus_off()))
                     self._take_off(t_ns, controller, disturbance.restart_ns)
         self._set_timer()
@@ -342,4 +359,4 @@ class Wire:
 
     def _set_timer(self) -> None:
         restarts = [c.restart_ns for c in self._controllers.values()]
-        self._timer_ns = min([*restarts, *(d.begin_ns for d in self._late)], default=NEVER_NS)
+        self._timer_ns = min([*restarts, *(d.begin_ns for d in self._taking_off)], default=NEVER_NS)

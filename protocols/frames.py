@@ -2,11 +2,14 @@
 
 The wire format is that of the `virtualcan` server, which independent CANopen masters already speak:
 u32be length (14) | u32be identifier with the SocketCAN flag bits | u8 flags | u8 dlc | 8 data bytes.
+Nobody else uses the flags; on the way to our hub they say which of several controllers behind one client sends, so that
+a true bus can let them contend and count their errors apart. The hub clears them.
 """
 
 import struct
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
+from itertools import repeat
 
 import msgspec
 
@@ -36,9 +39,14 @@ class Frame(msgspec.Struct, frozen=True, gc=False):
     dlc: int = 0
 
 
-def encode(frames: Iterable[Frame]) -> bytes:
-    """Virtualcan bytes of `frames`, ready for one `send`."""
-    return b"".join([_WIRE.pack(_WIRE_BODY, f.can_id, 0, f.dlc or len(f.data), f.data) for f in frames])
+def encode(frames: Iterable[Frame], stations: Iterable[int] = repeat(0)) -> bytes:
+    """Virtualcan bytes of `frames`, ready for one `send`.
+
+    Args:
+        stations: For each frame the controller that sends it, 0 to 255.
+    """
+    pairs = zip(frames, stations, strict=False)
+    return b"".join([_WIRE.pack(_WIRE_BODY, f.can_id, s, f.dlc or len(f.data), f.data) for f, s in pairs])
 
 
 def decode(buffer: bytes | bytearray | memoryview) -> Iterator[Frame]:
@@ -50,13 +58,19 @@ def decode(buffer: bytes | bytearray | memoryview) -> Iterator[Frame]:
     Raises:
         ValueError: A record's length field is not 14, or its DLC exceeds 8: the peer does not speak virtualcan.
     """
-    for length, can_id, _flags, dlc, data in _WIRE.iter_unpack(buffer):
+    for _, frame in decode_numbered(buffer):
+        yield frame
+
+
+def decode_numbered(buffer: bytes | bytearray | memoryview) -> Iterator[tuple[int, Frame]]:
+    """As `decode`, each frame with its station."""
+    for length, can_id, station, dlc, data in _WIRE.iter_unpack(buffer):
         if length != _WIRE_BODY or dlc > MAX_DATA:
             raise ValueError(f"not a virtualcan record: length {length} (14 expected), dlc {dlc} (at most 8)")
         if can_id & REMOTE:
-            yield Frame(can_id, b"", dlc)
+            yield station, Frame(can_id, b"", dlc)
         else:
-            yield Frame(can_id, data[:dlc])
+            yield station, Frame(can_id, data[:dlc])
 
 
 # --- length on the wire ---
