@@ -1,0 +1,184 @@
+"""Hypotheses about motor, power stage and sensors."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.explain.contract import Parameter
+from ident.explain.hypothesis import Flags, Hypothesis, Theta, gear, parameter, positive, within
+from ident.explain.scene import Scene, View
+
+Array = NDArray[np.float64]
+
+
+class CurrentOffset(Hypothesis):
+    """A current sensor that does not read zero at zero current."""
+
+    effect = "drive.current_offset"
+    group = "constant torque"
+    signature = "a constant torque, also at standstill"
+    experiments = ("standstill",)
+
+    def columns(self, scene: Scene, view: View, joint: int, theta: Theta) -> Array:
+        return np.ones((view.motion.samples, 1))
+
+    def parameters(self, scene: Scene, joint: int, theta: Theta, c: Array, std: Array) -> list[Parameter]:
+        drive = scene.model.robot.joint[joint].drive
+        per_A = drive.drive_gain_Nm_A * np.sign(drive.gear_ratio)
+        return [parameter(scene, joint, self.effect, "offset_A", c[0] / per_A, std[0] / abs(per_A))]
+
+
+class Gain(Hypothesis):
+    """A drive gain other than the nominal one: all torques of the joint are scaled."""
+
+    effect = "drive.gain"
+    group = "scale of torque"
+    signature = "all torques of the joint are larger or smaller than masses and inertias that are believed allow"
+    experiments = ("known mass",)
+
+    def columns(self, scene: Scene, view: View, joint: int, theta: Theta) -> Array:
+        return view.total[:, [joint]].copy()
+
+    def plausible(self, scene: Scene, joint: int, theta: Theta, c: Array) -> Flags:
+        return within(c, -0.6, 1.5)
+
+    def parameters(self, scene: Scene, joint: int, theta: Theta, c: Array, std: Array) -> list[Parameter]:
+        error = 1 / (1 + c[0]) - 1
+        return [parameter(scene, joint, self.effect, "error", error, std[0] * (1 + error) ** 2)]
+
+
+class Delay(Hypothesis):
+    """Currents older than their time stamp says, on one joint."""
+
+    effect = "drive.delay"
+    group = "timing"
+    signature = "torque errors in proportion to the rate of change of torque, in bursts at reversals"
+    experiments = ("dither",)
+
+    def columns(self, scene: Scene, view: View, joint: int, theta: Theta) -> Array:
+        return -_rate(view.total[:, [joint]], view)
+
+    def plausible(self, scene: Scene, joint: int, theta: Theta, c: Array) -> Flags:
+        return within(c, 0.0, 0.05)
+
+    def parameters(self, scene: Scene, joint: int, theta: Theta, c: Array, std: Array) -> list[Parameter]:
+        return [parameter(scene, joint, self.effect, "delay_s", c[0], std[0])]
+
+
+class CommonDelay(Delay):
+    """The same of all joints."""
+
+    whole = True
+
+    def grid(self, scene: Scene, joint: int) -> Sequence[Theta]:
+        return [{}] if joint == 0 and scene.joints > 1 else []
+
+    def columns(self, scene: Scene, view: View, joint: int, theta: Theta) -> Array:
+        return -_rate(view.total, view).T[:, :, None]
+
+
+class Saturation(Hypothesis):
+    """A torque constant that falls with the square of current."""
+
+    effect = "motor.saturation"
+    group = "saturation"
+    signature = "more current than in proportion at large torque, in both directions of motion"
+    experiments = ("static load",)
+    curve = "load"
+
+    def columns(self, scene: Scene, view: View, joint: int, theta: Theta) -> Array:
+        drive = scene.model.robot.joint[joint].drive
+        full = drive.drive_gain_Nm_A * drive.max_current_A
+        total = view.total[:, [joint]]
+        return np.asarray(total * (total / full) ** 2)
+
+    def plausible(self, scene: Scene, joint: int, theta: Theta, c: Array) -> Flags:
+        return positive(c)
+
+    def parameters(self, scene: Scene, joint: int, theta: Theta, c: Array, std: Array) -> list[Parameter]:
+        drive = scene.model.robot.joint[joint].drive
+        full = drive.drive_gain_Nm_A * drive.max_current_A
+        used = max(float(np.abs(v.total[:, joint]).max()) for v in scene.views) / full
+        return [
+            parameter(scene, joint, self.effect, "loss", c[0] * used**2, std[0] * used**2),
+            parameter(scene, joint, self.effect, "current_A", used * drive.max_current_A, 0.0),
+        ]
+
+
+class Ripple(Hypothesis):
+    """Torque harmonics of the motor's angle. Orders come from the scan at full bandwidth (`explain.ripple`)."""
+
+    effect = "motor.ripple"
+    group = "ripple"
+    signature = "a torque that repeats with position, of the same size at every speed"
+    experiments = ("slow pass",)
+
+    def grid(self, scene: Scene, joint: int) -> Sequence[Theta]:
+        return []
+
+    def columns(self, scene: Scene, view: View, joint: int, theta: Theta) -> Array:
+        angle = theta["order"] * gear(scene, joint) * view.motion.q[:, joint]
+        return np.column_stack([np.sin(angle), np.cos(angle)])
+
+    def parameters(self, scene: Scene, joint: int, theta: Theta, c: Array, std: Array) -> list[Parameter]:
+        amplitude = float(np.hypot(c[0], c[1]))
+        spread = float(np.hypot(*std) / np.sqrt(2))
+        sign = np.sign(scene.model.robot.joint[joint].drive.gear_ratio)
+        phase = float(np.arctan2(c[1], c[0]) * sign)
+        if sign < 0:
+            phase = float(np.arctan2(c[1], -c[0]))
+        return [
+            parameter(scene, joint, self.effect, "amplitude_Nm", amplitude, spread),
+            parameter(scene, joint, self.effect, "order", theta["order"], 0.0),
+            parameter(scene, joint, self.effect, "phase_rad", phase, spread / max(amplitude, 1e-12)),
+        ]
+
+
+class Eccentricity(Ripple):
+    """An encoder off its axis: positions, and so accelerations, have harmonics that the machine has not."""
+
+    effect = "sensor.eccentricity"
+    group = "ripple"
+    signature = "a torque that repeats with position and grows with the square of speed"
+    experiments = ("slow pass",)
+
+    def columns(self, scene: Scene, view: View, joint: int, theta: Theta) -> Array:
+        motion = view.motion
+        n = theta["order"] * gear(scene, joint)
+        angle = n * motion.q[:, joint]
+        v, a = motion.qd[:, joint], motion.qdd[:, joint]
+        inertia = view.axis_inertia[:, joint]
+        # the controller follows the false position; what the base model is charged with in vain is -J d²(error)/dt²
+        s, c = np.sin(angle), np.cos(angle)
+        return np.column_stack([-inertia * (n * a * c - (n * v) ** 2 * s), inertia * (n * a * s + (n * v) ** 2 * c)])
+
+    def parameters(self, scene: Scene, joint: int, theta: Theta, c: Array, std: Array) -> list[Parameter]:
+        spread = float(np.hypot(*std) / np.sqrt(2))
+        amplitude = float(np.hypot(c[0], c[1]))
+        return [
+            parameter(scene, joint, self.effect, "amplitude_rad", amplitude, spread),
+            parameter(scene, joint, self.effect, "order", theta["order"], 0.0),
+            parameter(
+                scene, joint, self.effect, "phase_rad", float(np.arctan2(c[1], c[0])), spread / max(amplitude, 1e-15)
+            ),
+        ]
+
+
+def _rate(total: Array, view: View) -> Array:
+    """Time derivative of shape (T, J)."""
+    if view.motion.circular:
+        ahead, behind = np.roll(total, -1, axis=0), np.roll(total, 1, axis=0)
+        return np.asarray((ahead - behind) / (2 * view.motion.dt_s))
+    return np.asarray(np.gradient(total, view.motion.dt_s, axis=0))
+
+
+DRIVES: tuple[Hypothesis, ...] = (
+    CurrentOffset(),
+    Gain(),
+    Delay(),
+    CommonDelay(),
+    Saturation(),
+    Ripple(),
+    Eccentricity(),
+)

@@ -1,0 +1,151 @@
+"""Harmonics of position, looked for at the full inner rate: decimation would remove those of fast motion."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy import linalg, signal
+
+from ident.explain import candidates
+from ident.explain.candidates import Batch
+from ident.explain.drives import Eccentricity, Ripple
+from ident.explain.hypothesis import gear
+from ident.explain.scene import Scene
+
+Array = NDArray[np.float64]
+
+AR_ORDER = 12  # of the model that whitens the residual
+FINE = 0.25  # step of orders times the range travelled [rad of harmonic phase over the range, over 2 pi / 4]
+MOST_ORDERS = 3000
+PEAKS = 8  # orders per joint that enter the competition
+STRIDE_HZ = 500.0
+
+
+@dataclass(frozen=True)
+class Order:
+    """One harmonic of position.
+
+    Attributes:
+        order: Periods per revolution of the motor.
+        per_rad: Periods per joint radian, times 2 pi.
+        gain: Held-out log-likelihood gain at the full inner rate [nats].
+        c: Coefficients of sine and cosine.
+        inside: Share of the harmonic's time below the band that the other hypotheses are judged in.
+    """
+
+    order: float
+    per_rad: float
+    gain: float
+    c: tuple[float, float]
+    std: float
+    inside: float
+
+
+def orders(scene: Scene, joint: int) -> list[Order]:
+    """Strongest harmonics of one joint, best first; those with a positive held-out gain."""
+    q = [v.motion.q[:, joint] for v in scene.views]
+    span = float(np.ptp(np.concatenate(q)))
+    if span <= 1e-9 or not any(w for w in scene.weight[joint]):
+        return []
+    residual = [_highpassed(v.residual[:, joint]) for v in scene.views]
+    taps = _whitening(residual)
+    white = [signal.lfilter(taps, [1.0], r) for r in residual]
+    white = [signal.lfilter(taps, [1.0], w[::-1])[::-1] for w in white]
+    innovation = float(np.median([np.var(signal.lfilter(taps, [1.0], r)[AR_ORDER:]) for r in residual]))
+    response = np.abs(np.fft.rfft(taps, 512)) ** 2
+    n_step = 2 * np.pi * FINE / span
+    rate = 1 / scene.views[0].motion.dt_s
+    fastest = max(float(np.quantile(np.abs(v.motion.qd[:, joint]), 0.3)) for v in scene.views)
+    n_max = min(2 * np.pi * 0.3 * rate / max(fastest, 1e-9), n_step * MOST_ORDERS)
+    per_rad = np.arange(4 * n_step, n_max, n_step)
+    if not per_rad.size or innovation <= 0:
+        return []
+    fold = [scene.fold[joint][scene.row_motion[joint] == k] for k in range(len(scene.views))]
+    pieces = sorted({int(f) for part in fold for f in part})
+    S = np.zeros((len(pieces), per_rad.size), dtype=complex)
+    V = np.zeros((len(pieces), per_rad.size))
+    for k, view in enumerate(scene.views):
+        row = np.clip(np.searchsorted(view.low.at, np.arange(view.motion.samples)), 0, len(view.low.at) - 1)
+        piece = np.searchsorted(pieces, fold[k][row])
+        live = (scene.weight[joint][scene.row_motion[joint] == k] > 0)[row].astype(float)
+        speed = np.abs(view.motion.qd[:, joint]) * view.motion.dt_s / np.pi  # of Nyquist, per unit of per_rad
+        _project(q[k], white[k], speed, live, piece, per_rad[0], n_step, response, S, V)
+    return _peaks(scene, joint, per_rad, S, V, innovation)
+
+
+def batches(scene: Scene, joint: int, found: list[Order]) -> list[Batch]:
+    """Ripple and eccentricity of these orders as candidates."""
+    thetas = [{"order": o.order} for o in found]
+    made = [candidates.batch(scene, h, joint, thetas) for h in (Ripple(), Eccentricity())]
+    return [b for b in made if b is not None]
+
+
+def _peaks(scene: Scene, joint: int, per_rad: Array, S: NDArray[np.complex128], V: Array, noise: float) -> list[Order]:
+    total_S, total_V = S.sum(axis=0), V.sum(axis=0)
+    gain = np.zeros(per_rad.size)
+    for k in range(len(S)):
+        rest = np.maximum(total_V - V[k], 1e-300)
+        c = (total_S - S[k]) / rest
+        gain += (2 * (np.conj(c) * S[k]).real - np.abs(c) ** 2 * V[k]) / (2 * noise)
+    c = total_S / np.maximum(total_V, 1e-300)
+    turns = gear(scene, joint)
+    speed = np.concatenate([np.abs(v.motion.qd[:, joint]) for v in scene.views])
+    out: list[Order] = []
+    for i in np.argsort(-gain):
+        if gain[i] <= 3.0 or len(out) >= PEAKS:
+            break
+        if any(abs(per_rad[i] - o.per_rad) < 4.5 * (per_rad[1] - per_rad[0]) for o in out):
+            continue
+        inside = float(np.mean(per_rad[i] * speed / (2 * np.pi) < 0.4 * scene.rate_Hz))
+        order = per_rad[i] / turns
+        whole = round(order)
+        if whole and abs(order - whole) * turns < (per_rad[1] - per_rad[0]):
+            order = float(whole)  # the motor's own harmonics are whole numbers
+        std = float(np.sqrt(noise / total_V[i]))
+        out.append(Order(float(order), float(per_rad[i]), float(gain[i]), (c[i].imag, c[i].real), std, inside))
+    return out
+
+
+def _highpassed(r: Array) -> Array:
+    return np.asarray(r - r.mean())
+
+
+def _whitening(residual: list[Array]) -> Array:
+    """Prediction error filter of the residual (Yule-Walker), shape (AR_ORDER + 1,)."""
+    r = np.zeros(AR_ORDER + 1)
+    for x in residual:
+        for k in range(AR_ORDER + 1):
+            r[k] += float(x[: len(x) - k] @ x[k:])
+    r[0] *= 1 + 1e-6
+    return np.concatenate([[1.0], -linalg.solve_toeplitz(r[:-1], r[1:])])
+
+
+@njit(cache=True)
+def _project(
+    q: Array,
+    white: Array,
+    speed: Array,
+    live: Array,
+    piece: NDArray[np.int64],
+    first: float,
+    step: float,
+    response: Array,
+    S: NDArray[np.complex128],
+    V: Array,
+) -> None:
+    """Adds sum exp(i n q) r and sum |A(n v)|² / 2 of every order n = first + k step to its piece."""
+    last = len(response) - 1
+    for t in range(len(q)):
+        if live[t] == 0.0:
+            continue
+        z = np.exp(1j * first * q[t])
+        turn = np.exp(1j * step * q[t])
+        p = piece[t]
+        for k in range(S.shape[1]):
+            x = (first + k * step) * speed[t]
+            if x >= 0.9:
+                break
+            S[p, k] += z * white[t]
+            V[p, k] += 0.5 * response[int(x * last)]
+            z *= turn
