@@ -46,6 +46,12 @@ BusOption = Annotated[
         help="NAME=INTERFACE:CHANNEL moves a bus, such as can0=socketcan:vcan0. A single - is a pipe of candump text.",
     ),
 ]
+EffectOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--effect", metavar="KEY@JOINT:name=value", help="Physics beyond the machine file, such as spring@joint3."
+    ),
+]
 DurationOption = Annotated[float | None, typer.Option("--duration", metavar="S", min=0.0, help="Stop after so long.")]
 JsonOption = Annotated[
     str | None,
@@ -132,14 +138,16 @@ def write_json(value: Any, destination: str | None) -> None:
         Path(destination).write_bytes(text + b"\n")
 
 
-def emulated(rig: "Rig", robot: "Robot", rig_name: str, seed: int | None) -> "EmulatedRig":
-    """The rig with its machine."""
+def emulated(rig: "Rig", robot: "Robot", rig_name: str, seed: int | None, effects: Sequence[str]) -> "EmulatedRig":
+    """The rig with its machine and what `--effect` adds to it."""
     from emulator.machine import load_machine
     from emulator.rig import EmulatedRig
     from protocols.config import locate
+    from protocols.effectentries import parse_effect
 
-    if seed is not None:
-        rig = msgspec.structs.replace(rig, emulated=msgspec.structs.replace(rig.emulated, seed=seed))
+    added = [*rig.emulated.effect, *(parse_effect(text) for text in effects)]
+    seed = rig.emulated.seed if seed is None else seed
+    rig = msgspec.structs.replace(rig, emulated=msgspec.structs.replace(rig.emulated, seed=seed, effect=added))
     return EmulatedRig(rig, load_machine(rig, robot, locate(rig_name).parent))
 
 
@@ -168,6 +176,7 @@ def emulate(
     motion: Annotated[str | None, typer.Option(metavar="MOTION", help="With --clock sim: what the host does.")] = None,
     duration: DurationOption = None,
     seed: Annotated[int | None, typer.Option(help="Of everything random; the rig file's otherwise.")] = None,
+    effect: EffectOption = None,
 ) -> None:
     """Emulate a rig: its drives on CAN, the arm behind them, the cell on Modbus/TCP.
 
@@ -175,14 +184,14 @@ def emulate(
     run in lock-step and the buses are written to stdout as candump text, for `armrig record RIG --bus -`.
     """
     if clock == "sim":
-        simulate(rig, motion, seed)
+        simulate(rig, motion, seed, effect or [])
     elif clock == "real":
-        emulate_on_buses(rig, [] if bus is None else bus, duration, seed)
+        emulate_on_buses(rig, bus or [], duration, seed, effect or [])
     else:
         raise ConfigError(f"--clock {clock}: choose real or sim.")
 
 
-def simulate(rig_name: str, motion: str | None, seed: int | None) -> None:
+def simulate(rig_name: str, motion: str | None, seed: int | None, effects: Sequence[str]) -> None:
     from emulator.host import Host
     from emulator.lockstep import lockstep
     from protocols.candump import format_frame
@@ -192,7 +201,7 @@ def simulate(rig_name: str, motion: str | None, seed: int | None) -> None:
     rig, robot = load(rig_name)
     report_loads(rig)
     host = Host(rig, robot, load_motion(motion))
-    cell = emulated(rig, robot, rig_name, seed)
+    cell = emulated(rig, robot, rig_name, seed, effects)
     names = [b.name for b in rig.bus]
     write = sys.stdout.write
 
@@ -220,7 +229,9 @@ class RealTime:
         return self._clock.now_ns() * 1e-9
 
 
-def emulate_on_buses(rig_name: str, moved: Sequence[str], duration: float | None, seed: int | None) -> None:
+def emulate_on_buses(
+    rig_name: str, moved: Sequence[str], duration: float | None, seed: int | None, effects: Sequence[str]
+) -> None:
     from emulator.bus import open_bus
     from emulator.cell import CellServer
     from emulator.hubprocess import HubProcess
@@ -230,8 +241,9 @@ def emulate_on_buses(rig_name: str, moved: Sequence[str], duration: float | None
 
     rig, robot = load(rig_name, moved)
     report_loads(rig)
-    arm = emulated(rig, robot, rig_name, seed)
-    emulated(rig, robot, rig_name, seed).plant.advance(*idle(robot.joints))  # compiles, where nothing is cached yet
+    arm = emulated(rig, robot, rig_name, seed, effects)
+    scratch = emulated(rig, robot, rig_name, seed, effects)
+    scratch.plant.advance(*idle(robot.joints))  # compiles what is not cached yet, before anyone relies on the rig
     with ExitStack() as stack:
         served = [(b.name, b.channel) for b in rig.bus if b.interface == "virtualcan"]
         channels = stack.enter_context(HubProcess(served)).channels if served else {}
@@ -665,6 +677,7 @@ def demo(
         "armrig-demo"
     ),
     clock: Annotated[str, typer.Option(help="real, or sim: as fast as the CPU allows.")] = "real",
+    effect: EffectOption = None,
 ) -> None:
     """Emulate, drive, record and identify an arm with four processes over CAN and Zenoh; prints the report's path.
 
@@ -676,7 +689,7 @@ def demo(
     if clock not in {"real", "sim"}:
         raise ConfigError(f"--clock {clock}: choose real or sim.")
     begin = RealTime()
-    with stopping() as stop, Demo(robot, out, stop, log) as chain:
+    with stopping() as stop, Demo(robot, out, stop, log, effect or []) as chain:
         print(chain.run(clock))
     print(f"{out / 'report.html'}   ({begin.seconds:.0f} s in all)")
 

@@ -2,7 +2,7 @@
 
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Self
@@ -12,6 +12,7 @@ import msgspec
 from emulator.child import RUN_S, Child, free_ports
 from emulator.machine import load_machine
 from protocols import config
+from protocols.effectentries import parse_effect
 from protocols.errors import ConfigError
 from protocols.rig import Rig, load_rig
 
@@ -27,10 +28,14 @@ class Demo:
         out: Folder for everything.
         stop: Set by Ctrl-C.
         log: Told what happens.
+        effects: Physics beyond the shipped machine, as in `--effect`.
     """
 
-    def __init__(self, robot: str, out: Path, stop: threading.Event, log: Callable[[str], None]) -> None:
+    def __init__(
+        self, robot: str, out: Path, stop: threading.Event, log: Callable[[str], None], effects: Sequence[str] = ()
+    ) -> None:
         self._robot, self._out, self._stop, self._log = robot, out, stop, log
+        self._effects = [parse_effect(text) for text in effects]
         self._children = ExitStack()
 
     def __enter__(self) -> Self:
@@ -100,6 +105,8 @@ class Demo:
     def _free_rig(self) -> tuple[Path, Rig]:
         """The shipped rig on ports that are free here, so that several demonstrations may run at once."""
         rig = on_free_ports(load_rig(f"{self._robot}-rig")[0])
+        emulated = msgspec.structs.replace(rig.emulated, effect=[*rig.emulated.effect, *self._effects])
+        rig = msgspec.structs.replace(rig, emulated=emulated)
         path = self._out / "rig.toml"
         path.write_text(config.to_toml(rig))
         for name in MOTIONS:
