@@ -69,10 +69,17 @@ class Statistic(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Simulation(msgspec.Struct, frozen=True):
-    """Closed-loop simulation against the recording, per joint."""
+    """Closed-loop simulation under the recorded control law against the recording, per joint.
 
-    position_error_percent: list[float]
-    torque_error_percent: list[float]
+    Attributes:
+        position_error_percent: ||q - qs|| / ||q||; None for a joint that stays at zero.
+        torque_error_percent: The same of torques, in the bandwidth of the fit.
+        runs: Recordings simulated.
+    """
+
+    position_error_percent: list[float | None]
+    torque_error_percent: list[float | None]
+    runs: list[str] = []
 
 
 class Iterate(msgspec.Struct, frozen=True):

@@ -1,22 +1,26 @@
 """From signals to the answer: the one place that puts dataset, model, estimate, tests and validation in order."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 import numpy as np
 
 from ident import contract
+from ident.auxiliary import standard
 from ident.base import Base, base_parameters
+from ident.covariance import named
 from ident.dataset import FILTER_HZ, Signals, prepare
 from ident.estimate import Estimate
 from ident.methods import METHODS
 from ident.model import Model
 from ident.observation import DECIMATE_TO_HZ, Observation, observe, relative_error
-from ident.problem import Problem
+from ident.problem import Estimator, Problem
 from ident.reduction import Reduction, reduce
+from ident.simulation import closed_loop
 from ident.statistics import statistics
 from protocols.clock import Clock, RealClock
-from protocols.errors import ConfigError, DataError
+from protocols.errors import ArmrigError, ConfigError, DataError
 from protocols.robot import Robot
 
 Progress = Callable[[float, str], None]
@@ -31,12 +35,16 @@ class Settings:
         decimate_to_Hz: Rate of the rows.
         speed_threshold_rad_s: Slower rows are not used; None for a share of each joint's peak speed.
         offsets: Identify a constant torque per joint.
+        covariance: Name of `ident.covariance`, for the methods that have a choice.
+        simulate: Simulate the closed loop with every estimate; methods that simulate anyway always do.
     """
 
     filter_Hz: float = FILTER_HZ
     decimate_to_Hz: float = DECIMATE_TO_HZ
     speed_threshold_rad_s: float | None = None
     offsets: bool = True
+    covariance: str = "hac"
+    simulate: bool = False
 
 
 DEFAULTS = Settings()
@@ -96,22 +104,36 @@ def identify(
         datasets.append(prepare(signals, settings.filter_Hz))
         observations.append(observe(datasets[-1], model, base, settings.decimate_to_Hz, settings.speed_threshold_rad_s))
     seen, unseen = observations[: len(runs)], observations[len(runs) :]
-    problem = Problem(
-        model, base, runs, datasets[: len(runs)], seen, settings.decimate_to_Hz, settings.speed_threshold_rad_s
-    )
+    grid = settings.decimate_to_Hz, settings.speed_threshold_rad_s
+    problem = Problem(model, base, runs, datasets[: len(runs)], seen, *grid)
+    judged = Problem(model, base, validation, datasets[len(runs) :], unseen, *grid) if validation else problem
     recordings = [_run(s, "fit") for s in runs] + [_run(s, "validation") for s in validation]
     prepared_ns = clock.now_ns() - started
     out = []
     for index, method in enumerate(methods):
         progress(0.7 + 0.3 * index / len(methods), METHODS[method].name)
         begun = clock.now_ns()
-        fitted = METHODS[method].fit(problem)
+        fitted = estimator(method, settings).fit(problem)
         reduction = reduce(fitted)
         seconds = (prepared_ns + clock.now_ns() - begun) * 1e-9
-        result = _result(fitted, reduction, model, seen, unseen, truth or {}, seconds, recordings)
+        simulation = _simulate(judged, fitted, asked=settings.simulate)
+        result = _result(fitted, reduction, model, seen, unseen, truth or {}, seconds, recordings, simulation)
         out.append(Identification(result, model, base, fitted, reduction, seen, unseen, truth or {}))
     progress(1.0, "done")
     return out
+
+
+def estimator(method: str, settings: Settings = DEFAULTS) -> Estimator:
+    """The method of a name, with the covariance asked for where it has a choice.
+
+    Raises:
+        ConfigError: Unknown covariance.
+    """
+    found = METHODS[method]
+    if settings.covariance == DEFAULTS.covariance or not hasattr(found, "covariance"):
+        return found
+    chosen: Estimator = replace(cast(Any, found), covariance=named(settings.covariance))  # a frozen dataclass
+    return chosen
 
 
 def truth_values(nominal: Robot, machine: Robot, settings: Settings = DEFAULTS) -> dict[str, float]:
@@ -140,6 +162,16 @@ def _run(signals: Signals, role: str) -> contract.Run:
     return contract.Run(signals.source, role, signals.verdict, seconds, signals.t_s.size, signals.sha256)
 
 
+def _simulate(judged: Problem, fitted: Estimate, *, asked: bool) -> tuple[contract.Simulation | None, str]:
+    """Closed loop with the estimate, on unseen recordings where there are any; or why there is none."""
+    if not (asked or fitted.history):
+        return None, "simulation: null, no closed-loop simulation was asked for."
+    try:
+        return closed_loop(judged, standard(judged.base, fitted.beta)), ""
+    except ArmrigError as error:
+        return None, f"simulation: null. {error}"
+
+
 def _result(
     fitted: Estimate,
     reduction: Reduction,
@@ -149,6 +181,7 @@ def _result(
     truth: Mapping[str, float],
     seconds: float,
     recordings: list[contract.Run],
+    simulation: tuple[contract.Simulation | None, str],
 ) -> contract.Result:
     base = fitted.base
     prior = base.B @ model.theta(model.robot)
@@ -169,7 +202,7 @@ def _result(
     notes = [
         *fitted.notes,
         *(note for o in unseen for note in o.notes),
-        "simulation: null, no closed-loop simulation was asked for.",
+        *filter(None, [simulation[1]]),
         "physically_consistent: null, base parameters alone do not determine masses and inertias.",
     ]
     return contract.Result(
@@ -179,7 +212,7 @@ def _result(
         parameters=parameters,
         fit=fit_quality(seen, fitted, truth),
         validation=fit_quality(unseen, fitted, truth) if unseen else None,
-        simulation=None,
+        simulation=simulation[0],
         statistics=[*statistics(fitted, seen, reduction), *fitted.tests],
         iterations=fitted.iterations,
         converged=fitted.converged,

@@ -3,6 +3,8 @@
 
 from collections.abc import Mapping
 
+from ident.cloe import Cloe
+from ident.didim import Didim
 from ident.ekf import ExtendedKalman
 from ident.estimate import LeastSquares
 from ident.irls import IterativelyReweighted
@@ -16,6 +18,8 @@ METHODS: Mapping[str, Estimator] = {
     "ols": LeastSquares(weighted=False),
     "wls": LeastSquares(weighted=True),
     "iv": IdimIv(),
+    "didim": Didim(),
+    "cloe": Cloe(),
     "irls": IterativelyReweighted(),
     "tls": TotalLeastSquares(),
     "ml": MaximumLikelihood(),

@@ -1,5 +1,7 @@
 """A recording as identification wants it: joint positions and torques of the cycles in which every drive was heard."""
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,7 +35,7 @@ def signals(recording: Recording) -> Signals:
         notes=_saturation(recording),
         verdict=recording.verdict,
         sha256=recording.sha256,
-        command=lambda: command(recording, whole),
+        command=cache(lambda: command(recording, whole)),
     )
 
 

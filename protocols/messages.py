@@ -38,7 +38,7 @@ LogId = Annotated[str, Meta(pattern=_LOG_ID)]  # an index entry, never a path
 Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
 Count = Annotated[int, Meta(ge=0)]
 
-Method = Literal["ols", "wls", "iv", "irls", "tls", "ml", "ekf", "setmembership"]
+Method = Literal["ols", "wls", "iv", "didim", "cloe", "irls", "tls", "ml", "ekf", "setmembership"]
 METHODS: tuple[Method, ...] = get_args(Method)
 Part = Literal["result", "html", "model"]
 Status = Literal["ok", "failed"]
