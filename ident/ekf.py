@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ident.dataset import Segment, Signals
 from ident.estimate import Estimate, assemble, joint_rows, joint_sigma, refuse_deficient
-from ident.positionnoise import DIFFERENCES, GAIN, position_noise
+from ident.positionnoise import position_noise, white_noise
 from ident.problem import Problem
 from ident.system import triangle
 from ident.writeback import prior_sigma
@@ -20,12 +20,10 @@ from protocols.errors import IdentificationError
 
 Array = NDArray[np.float64]
 
-RATE_HZ = 1000.0  # of the filter's steps at most: the arm's own motion is below 50 Hz
-NORMAL_MAD = 0.6745
 FINEST_RAD = 1e-8  # position noise assumed at least
 STEP = 1e-6  # of q and dq for the model's slopes
 TURNING = 3.0  # standard deviations of a speed within which its sign is uncertain
-LOST = 50.0  # innovation in its standard deviations, mean over joints, from which on the filter has lost the motion
+LOST = 1000.0  # innovation in its standard deviations; wrong parameters alone give tens at a turn
 
 
 @dataclass(frozen=True)
@@ -36,10 +34,12 @@ class ExtendedKalman:
         prior_factor: Standard deviations of the start over those of the robot file.
         passes: Times the recordings are run through, each starting from the end of the one before with fresh
             covariance; 1 is the filter as published.
+        rate_Hz: Of the filter's steps, at most: the arm's own motion is below 50 Hz.
     """
 
     prior_factor: float = 1.0
     passes: int = 1
+    rate_Hz: float = 1000.0
 
     @property
     def name(self) -> str:
@@ -61,7 +61,7 @@ class ExtendedKalman:
             P = prior
             for signals, dataset in zip(problem.signals, problem.datasets, strict=True):
                 for segment in dataset.segments:
-                    beta, P = _filter(problem, signals, segment, sigma, beta, P)
+                    beta, P = _filter(problem, signals, segment, sigma, beta, P, self.rate_Hz)
         return assemble(
             observations,
             base,
@@ -77,17 +77,17 @@ class ExtendedKalman:
 
 
 def _filter(
-    problem: Problem, signals: Signals, segment: Segment, sigma: Array, beta: Array, P_beta: Array
+    problem: Problem, signals: Signals, segment: Segment, sigma: Array, beta: Array, P_beta: Array, rate_Hz: float
 ) -> tuple[Array, Array]:
     """Parameters and their covariance after one gapless stretch."""
     J, b = problem.model.joints, len(beta)
     period = float(segment.t_s[1] - segment.t_s[0])
-    every = max(1, round(1 / period / RATE_HZ))
+    every = max(1, round(1 / period / rate_Hz))
     at = np.searchsorted(signals.t_s, segment.t_s - period / 2)[::every]
     q, tau = signals.q[at], segment.tau_Nm[::every]
     dt = every * period
     noise = max(position_noise(signals.q), FINEST_RAD)
-    torque = np.sqrt(_torque_noise(segment.tau_Nm) ** 2 + sigma**2)
+    torque = np.sqrt(white_noise(segment.tau_Nm) ** 2 + sigma**2)
     x = np.concatenate([q[0], segment.qd[0], beta])
     P = np.zeros((2 * J + b, 2 * J + b))
     P[:J, :J] = noise**2 * np.eye(J)
@@ -129,12 +129,12 @@ def predict(problem: Problem, x: Array, tau: Array, dt: float) -> tuple[Array, A
     A = np.vstack([still, still, unit])
     torques = problem.model.regressor(Q, V, A)[:, :, kept] @ beta  # (J, J + 2)
     M = torques[:, 2:] - torques[:, [1]]
-    try:
-        M_inverse = np.linalg.inv(M)
-    except np.linalg.LinAlgError as error:
+    if not np.linalg.eigvalsh((M + M.T) / 2)[0] > 0:
         raise IdentificationError(
-            "The EKF's inertia matrix became singular. Start from better a-priori parameters, or use wls or iv."
-        ) from error
+            "The EKF lost its way: the inertia matrix of its parameters is no longer positive. Start from better"
+            " a-priori parameters or smaller sigmas (a start far off is what it does not survive), or use wls or iv."
+        )
+    M_inverse = np.linalg.inv(M)
     qdd = M_inverse @ (tau - torques[:, 0])
     Q = np.vstack([q, q + STEP * unit, np.tile(q, (J, 1))])
     V = np.vstack([qd, np.tile(qd, (J, 1)), qd + STEP * unit])
@@ -143,7 +143,7 @@ def predict(problem: Problem, x: Array, tau: Array, dt: float) -> tuple[Array, A
     by_q = -M_inverse @ (torques[:, 1 : J + 1] - torques[:, [0]]) / STEP
     by_qd = -M_inverse @ (torques[:, J + 1 :] - torques[:, [0]]) / STEP
     by_beta = -M_inverse @ W[:, 0]
-    qdd = np.linalg.solve(np.eye(J) - dt / 2 * by_qd, qdd)
+    qdd = np.asarray(np.linalg.solve(np.eye(J) - dt / 2 * by_qd, qdd), dtype=float)
     F = np.eye(len(x))
     F[J : 2 * J] += dt * np.hstack([by_q, by_qd, by_beta])
     F[:J] += dt**2 / 2 * np.hstack([by_q, by_qd, by_beta])
@@ -166,9 +166,3 @@ def _turning(problem: Problem, before: Array, after: Array, P: Array) -> Array:
     own = np.array([value.get(f"Fc{j + 1}", 0.0) for j in range(J)])
     motor = np.array([value.get(f"fc_m{j + 1}", 0.0) for j in range(J)])
     return np.asarray(uncertain * own + np.abs(C).T @ (uncertain * motor))
-
-
-def _torque_noise(tau: Array) -> Array:
-    """Standard deviation of white noise per joint, by the median of sixth differences: steps of friction are few."""
-    d = np.abs(np.diff(tau, n=DIFFERENCES, axis=0))
-    return np.asarray(np.median(d, axis=0) / NORMAL_MAD / np.sqrt(GAIN))

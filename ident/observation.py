@@ -38,6 +38,9 @@ class Observation:
         rate_Hz: Of the grid.
         bandwidth_Hz: Of torque and columns.
         notes: What was left out and why.
+
+    Raises:
+        DataError: A row used is not a number.
     """
 
     source: str
@@ -50,6 +53,15 @@ class Observation:
     rate_Hz: float
     bandwidth_Hz: float
     notes: list[str]
+
+    def __post_init__(self) -> None:
+        bad = ~(np.isfinite(self.W).all(axis=2) & np.isfinite(self.y)) & self.used
+        if bad.any():
+            joint, row = np.argwhere(bad)[0]
+            raise DataError(
+                f"{self.source}: the row of {self.joints[joint]} at {self.t_s[row]:.3f} s is not a number. Cut that"
+                " part out or record again."
+            )
 
     @property
     def rows(self) -> int:

@@ -12,6 +12,7 @@ from ident.problem import Problem
 Array = NDArray[np.float64]
 
 DIFFERENCES, GAIN = 6, 924.0  # sixth differences of unit white noise; a 10 Hz motion at 1 kHz leaves 6e-8 of itself
+NORMAL_MAD = 0.6745  # median of |x| for a standard normal x
 STEPS = (1e-5, 1e-4, 1e-3)  # of q, dq, ddq for central differences of columns: error 1e-10, rounding 1e-11
 ROWS = 2000  # of a recording, enough for a root mean square over its motion
 
@@ -38,7 +39,20 @@ def position_noise(q: Array) -> float:
     Args:
         q: As recorded, shape (T, J).
     """
-    return float(np.sqrt(np.mean(np.diff(q, n=DIFFERENCES, axis=0) ** 2) / GAIN))
+    return float(np.sqrt(np.mean(white_noise(q) ** 2)))
+
+
+def white_noise(x: Array) -> Array:
+    """Standard deviation of white noise on smooth signals by their sixth differences, shape (J,).
+
+    The median leaves out jumps; where most differences are zero (an encoder at rest) it is the root mean square.
+
+    Args:
+        x: shape (T, J).
+    """
+    d = np.diff(x, n=DIFFERENCES, axis=0)
+    middle = np.median(np.abs(d), axis=0) / NORMAL_MAD
+    return np.asarray(np.where(middle > 0, middle, np.sqrt(np.mean(d**2, axis=0))) / np.sqrt(GAIN))
 
 
 def state_covariance(dataset: Dataset, o: Observation) -> Array:
