@@ -27,6 +27,9 @@ HOST_LOST_MS = 500  # drives stop by themselves when the host has been silent fo
 ANSWER_PERIODS = 1000  # SDO timeout
 ENABLE_PERIODS = 2000
 BRAKING_S = 0.5  # from any speed to rest after a stop request
+DRIVE_BEAT_MS = 100
+DRIVE_LOST_S = 0.35  # three heartbeats missed, and a little more
+QUICK_STOP_S = 0.3  # for the drives' own ramps, and their brakes
 
 _POSITION, _TARGET_TORQUE, _TARGET_POSITION = key(0x6064), key(0x6071), key(0x607A)
 _AIM = {cia402.Mode.CST: _TARGET_TORQUE, cia402.Mode.CSP: _TARGET_POSITION}
@@ -63,6 +66,15 @@ class PdLaw:
         return np.clip(torque, -self._limit, self._limit) @ self._to_current
 
 
+def interpolation_period(period_s: float) -> tuple[int, int]:
+    """Value and power of ten for 0x60C2, as exact as one byte allows."""
+    index = next((i for i in range(-6, 0) if round(period_s * 10.0**-i) <= 0xFF), 0)
+    value = round(period_s * 10.0**-index)
+    while value % 10 == 0 and index < 0:
+        value, index = value // 10, index + 1
+    return value, index
+
+
 @dataclass
 class _Axis:
     """One drive as the host knows it."""
@@ -76,6 +88,8 @@ class _Axis:
     mode: int = 0
     transfer: sdo.Download | sdo.Upload | None = None
     error: emcy.Emergency | None = None
+    heard: int = 0  # cycle of the last heartbeat
+    booted: bool = False  # since the motion began
 
     @property
     def name(self) -> str:
@@ -120,6 +134,7 @@ class Host:
                 (nmt.tpdo_id(2, axis.node), self._on_status),
                 (nmt.sdo_response_id(axis.node), self._on_sdo),
                 (nmt.emcy_id(axis.node), self._on_emcy),
+                (nmt.heartbeat_id(axis.node), self._on_heartbeat),
             )
         }
         self._counter = 0
@@ -149,6 +164,7 @@ class Host:
             yield from self._follow(path)
         except PeerError as error:  # whatever one drive does, none may stay powered
             fault = error
+            yield from self._quick_stop()
         yield from self._disable()
         if fault is not None:
             raise fault
@@ -196,7 +212,13 @@ class Host:
             self._requests[axis.bus].append(Frame(nmt.sdo_request_id(axis.node), request))
 
     def _on_emcy(self, axis: _Axis, frame: Frame) -> None:
-        axis.error = emcy.decode(frame.data)
+        message = emcy.decode(frame.data)
+        if message is not None and message.code not in emcy.WARNINGS:
+            axis.error = message
+
+    def _on_heartbeat(self, axis: _Axis, frame: Frame) -> None:
+        axis.heard = self._beat
+        axis.booted |= nmt.decode_heartbeat(frame.data) is nmt.State.INITIALISING
 
     # --- configuration ---
 
@@ -209,11 +231,14 @@ class Host:
     def _settings(self, node: int) -> list[tuple[int, int, bytes]]:
         """(index, sub, value) in the order that CiA 301, 7.5.2.36 asks for when a PDO is remapped."""
         feedback, target = ([pdo.Mapped.parse(t) for t in texts] for texts in self._layouts)
+        value, index = interpolation_period(self._period_s)
         return [
             *pdo.configuration(pdo.TRANSMIT, 1, nmt.tpdo_id(1, node), feedback, 1),
             *pdo.configuration(pdo.RECEIVE, 2, nmt.rpdo_id(2, node), target, 1),
             (0x1019, 0, bytes([self._overflow])),
             (0x1016, 1, (HOST_NODE << 16 | HOST_LOST_MS).to_bytes(4, "little")),
+            (0x1017, 0, DRIVE_BEAT_MS.to_bytes(2, "little")),
+            *((0x60C2, sub, bytes([part & 0xFF])) for sub, part in ((1, value), (2, index))),
             (0x6060, 0, bytes([self._mode])),
         ]
 
@@ -283,17 +308,43 @@ class Host:
         return cia402.state_of(axis.statusword) is cia402.State.OPERATION_ENABLED and axis.mode == self._mode
 
     def _follow(self, path: motion.Reference) -> Script:
+        for axis in self._axes:
+            axis.booted, axis.heard = False, self._beat
         for k, reference in enumerate(path.q):
             if self._stopping:
                 yield from self._brake(reference, path.qd[k])
                 return
             yield from self._cycle(self._aim(reference))
             for axis in self._axes:
-                if axis.error is not None and axis.error.code:
+                trouble = self._trouble(axis)
+                if trouble:
                     raise PeerError(
-                        f"{axis.name}: the drive reports error {axis.error.code:04X}h after"
-                        f" {k * self._period_s:.3f} s of motion; all drives are being switched off."
+                        f"{axis.name}: {trouble} after {k * self._period_s:.3f} s of motion; all drives are being"
+                        " switched off."
                     )
+
+    def _trouble(self, axis: _Axis) -> str:
+        """What is wrong with a drive that should be following; empty if nothing."""
+        if axis.booted:
+            return "the drive has been reset"
+        if axis.error is not None and axis.error.code:
+            return f"the drive reports error {axis.error.code:04X}h"
+        if not self._is_enabled(axis):
+            return f"the drive has left OPERATION ENABLED (statusword {axis.statusword:04X}h)"
+        silent_s = (self._beat - axis.heard) * self._period_s
+        return f"no heartbeat for {silent_s:.2f} s" if silent_s > DRIVE_LOST_S else ""
+
+    def _quick_stop(self) -> Script:
+        """Have every drive that can brake on its own."""
+        for _ in range(round(QUICK_STOP_S / self._period_s)):
+            yield from self._command(cia402.Command.QUICK_STOP)
+
+    def _command(self, command: cia402.Command) -> Script:
+        burst = self._box()
+        for axis in self._axes:
+            axis.controlword = cia402.CONTROLWORD[command]
+            burst[axis.bus].append(self._control(axis))
+        yield from self._cycle(burst)
 
     def _brake(self, q: NDArray[np.float64], qd: NDArray[np.float64]) -> Script:
         steps = round(BRAKING_S / self._period_s)
@@ -304,11 +355,7 @@ class Host:
     def _disable(self) -> Script:
         for command in (cia402.Command.SHUTDOWN, cia402.Command.DISABLE_VOLTAGE):
             for _ in range(10):
-                burst = self._box()
-                for axis in self._axes:
-                    axis.controlword = cia402.CONTROLWORD[command]
-                    burst[axis.bus].append(self._control(axis))
-                yield from self._cycle(burst)
+                yield from self._command(command)
         yield from self._cycle(self._broadcast(nmt.Command.ENTER_PRE_OPERATIONAL), sync=False)
         with contextlib.suppress(PeerError):  # a drive that no longer answers is off, or told already
             yield from self._write([(0x1016, 1, bytes(4))] * len(self._axes))  # nobody is to miss us

@@ -12,27 +12,33 @@ import numpy as np
 
 from emulator.axis import Measurement
 from emulator.drive import Drive
+from emulator.faults import Fault, Kind
+from emulator.impaired import ImpairedDrive, Schedule
 from emulator.plant import Plant
 from protocols import nmt
 from protocols.cell import CellState
 from protocols.errorframes import Class, State, decode
+from protocols.errors import ConfigError
 from protocols.frames import ERROR, Frame
 from protocols.rig import Rig
 from protocols.robot import Joint, Robot
 
 SILENT_PERIODS = 20  # without SYNC for so long, the arm follows the clock: a host at rest must not freeze it
 NO_COUNTER = -1
+
+Unit = Drive | ImpairedDrive
 PATIENCE_PERIODS = 2  # how long one bus waits for the SYNC of another before going on alone
 
 
 class _Segment:
     """One bus as the rig sees it: who is on it and which frames wait to be handled."""
 
-    def __init__(self, drives: list[tuple[int, Drive]]) -> None:
+    def __init__(self, name: str, drives: list[tuple[int, Unit]]) -> None:
+        self.name = name
         self.drives = drives
         self.waiting: deque[Frame] = deque()
-        self.overheard: deque[tuple[Drive, Frame]] = deque()  # sent by one drive, meant for another
-        self.off: set[Drive] = set()  # whose controllers are bus-off
+        self.overheard: deque[tuple[Unit, Frame]] = deque()  # sent by one drive, meant for another
+        self.off: set[Unit] = set()  # whose controllers are bus-off
         self.latched = False  # has seen the SYNC of the present instant
         self.active = False  # carries SYNC
 
@@ -40,6 +46,9 @@ class _Segment:
         """Counter of the SYNC that waits."""
         data = self.waiting[0].data
         return data[0] if data else NO_COUNTER
+
+
+Pairs = Sequence[tuple[_Segment, list[Frame]]]  # buses, and what they get to carry
 
 
 class EmulatedRig:
@@ -76,14 +85,17 @@ class EmulatedRig:
         ]
         self._segments = [
             _Segment(
+                bus.name,
                 [
                     (j, drive)
                     for j, (joint, drive) in enumerate(zip(machine.joint, self.drives, strict=True))
                     if place[joint.name].bus == bus.name
-                ]
+                ],
             )
             for bus in rig.bus
         ]
+        self._joints = machine.joint_names
+        self._schedule = Schedule()
         self._tracing = False
         self._supply_V = max(joint.drive.bus_voltage_V for joint in machine.joint)
         self._mode = np.zeros(joints, dtype=np.int64)
@@ -105,6 +117,26 @@ class EmulatedRig:
         """Power on: the boot-up messages, per bus."""
         return [[f for _, drive in s.drives for f in drive.start(t_ns)] for s in self._segments]
 
+    def schedule(self, fault: Fault) -> None:
+        """Have something go wrong later.
+
+        Raises:
+            ConfigError: There is no such joint or bus; says which there are.
+        """
+        buses = [segment.name for segment in self._segments]
+        if fault.place and fault.place not in {*self._joints, *buses}:
+            raise ConfigError(
+                f"fault {fault.text}: the rig has no {fault.place}; write one of {', '.join([*buses, *self._joints])}."
+            )
+        for segment in self._segments:
+            for n, (j, drive) in enumerate(segment.drives):
+                if fault.place in {"", segment.name, self._joints[j]}:
+                    impaired = drive if isinstance(drive, ImpairedDrive) else ImpairedDrive(drive)
+                    segment.drives[n] = j, impaired
+                    self._schedule.add(fault, impaired)
+                    if fault.kind is Kind.GARBAGE and fault.place in {"", segment.name}:
+                        break  # once per bus, not per drive
+
     def step(self, t_ns: int, received: Sequence[Sequence[Frame]]) -> list[list[Frame]]:
         """Handle what has arrived on each bus and what is due by `t_ns`.
 
@@ -119,6 +151,8 @@ class EmulatedRig:
         for segment, frames in zip(self._segments, received, strict=True):
             segment.waiting.extend(frames)
         pairs = list(zip(self._segments, out, strict=True))
+        if t_ns >= self._schedule.next_ns:
+            self._go_wrong(t_ns, pairs)
         progress = True
         while progress:
             for segment, sent in pairs:
@@ -129,6 +163,12 @@ class EmulatedRig:
             for _, drive in segment.drives:
                 _say(segment, drive, drive.tick(t_ns), sent)
         return out
+
+    def _go_wrong(self, t_ns: int, pairs: Pairs) -> None:
+        for victim, frames in self._schedule.run(t_ns):
+            for segment, sent in pairs:
+                if any(drive is victim for _, drive in segment.drives):
+                    _say(segment, victim, frames, sent)
 
     def cell(self) -> CellState:
         """What the cell's sensors see of the machine."""
@@ -144,7 +184,7 @@ class EmulatedRig:
         for _ in range(len(segment.overheard)):  # what they say to each other meanwhile is for the next time
             speaker, frame = segment.overheard.popleft()
             for _, drive in segment.drives:
-                if drive is not speaker:
+                if drive is not speaker and drive not in segment.off:
                     _say(segment, drive, drive.receive(t_ns, frame), sent)
         waiting = segment.waiting
         while waiting and waiting[0].can_id != nmt.SYNC:
@@ -177,7 +217,7 @@ class EmulatedRig:
             self._obey(j, drive)
         return True
 
-    def _obey(self, j: int, drive: Drive) -> None:
+    def _obey(self, j: int, drive: Unit) -> None:
         """Hand a drive's wishes to its power stage."""
         self._mode[j], self._position[j], self._current[j] = drive.command()
         gains, limit_A = drive.changed_gains(), drive.changed_limit()
@@ -206,7 +246,7 @@ class EmulatedRig:
             segment.latched = False
         return True
 
-    def _free_run(self, t_ns: int, pairs: Sequence[tuple[_Segment, list[Frame]]]) -> None:
+    def _free_run(self, t_ns: int, pairs: Pairs) -> None:
         """Without SYNC the arm, and the drives' own motions, go on with the clock."""
         if t_ns - self._instant_ns < SILENT_PERIODS * self.period_ns:
             return
@@ -237,7 +277,7 @@ class EmulatedRig:
         self._measured = list(map(Measurement, counts.tolist(), speed.tolist(), current.tolist()))
 
 
-def _say(segment: _Segment, speaker: Drive, frames: list[Frame], sent: list[Frame]) -> None:
+def _say(segment: _Segment, speaker: Unit, frames: list[Frame], sent: list[Frame]) -> None:
     """A drive sends; the others on its bus may be listening. They hear it with the rig's next step."""
     if speaker in segment.off:
         return
