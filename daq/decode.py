@@ -6,26 +6,13 @@ from functools import partial
 from daq.cycles import Assembler, Cycle, DriveLine
 from daq.feedback import Reader, reader
 from daq.integrity import Integrity
-from protocols import emcy, nmt
+from protocols import emcy, errorframes, nmt
 from protocols.frames import ERROR, Frame
 from protocols.rig import DriveNode, Rig
 from protocols.robot import Robot
 from protocols.topics import ERROR_LEVEL, INFO, WARNING, Event
 
-# Classes of SocketCAN error frames, linux/can/error.h
-_ERROR_CLASSES = {
-    0x001: "transmission timed out",
-    0x002: "arbitration lost",
-    0x004: "controller problem (overrun or error passive)",
-    0x008: "protocol violation",
-    0x010: "transceiver problem",
-    0x020: "no acknowledgement: nobody else is on the bus",
-    0x040: "BUS OFF: the controller has left the bus",
-    0x080: "bus error",
-    0x100: "controller restarted",
-}
-_BUS_OFF = 0x040
-
+_LEVELS: dict[errorframes.State | None, int] = {errorframes.State.BUS_OFF: ERROR_LEVEL, errorframes.State.ACTIVE: INFO}
 _COMMANDS = {
     nmt.Command.START: "start",
     nmt.Command.STOP: "stop",
@@ -80,6 +67,7 @@ class Decoder:
             integrity,
         )
         self._states: dict[tuple[str, int], nmt.State] = {}
+        self._off_since_ns: dict[str, int] = {}
         self._drives: dict[tuple[str, int], DriveLine] = {}
         self._handlers: dict[str, dict[int, Callable[[int, bytes], None]]] = {}
         nodes = {d.joint: d for d in rig.drive}
@@ -107,7 +95,7 @@ class Decoder:
             if handler is not None:
                 handler(t_ns, frame.data)
             elif frame.can_id & ERROR:
-                self._bus_error(t_ns, bus, frame.can_id)
+                self._bus_error(t_ns, bus, frame)
         self.integrity.bus[bus].frames += count
 
     def finish(self, *, cut_off: bool = False) -> None:
@@ -184,7 +172,11 @@ class Decoder:
             )
             self._events.append(Event(t_ns, ERROR_LEVEL, node.joint, text))
 
-    def _bus_error(self, t_ns: int, bus: str, can_id: int) -> None:
-        said = [text for bit, text in _ERROR_CLASSES.items() if can_id & bit] or ["unknown error"]
-        level = ERROR_LEVEL if can_id & _BUS_OFF else WARNING
-        self._events.append(Event(t_ns, level, bus, f"error frame: {', '.join(said)}"))
+    def _bus_error(self, t_ns: int, bus: str, frame: Frame) -> None:
+        report = errorframes.decode(frame)
+        text = f"error frame: {report.text}"
+        if report.state is errorframes.State.BUS_OFF:
+            self._off_since_ns.setdefault(bus, t_ns)
+        elif report.classes & errorframes.Class.RESTARTED and bus in self._off_since_ns:
+            text += f" after {(t_ns - self._off_since_ns.pop(bus)) * 1e-9:.3f} s off the bus"
+        self._events.append(Event(t_ns, _LEVELS.get(report.state, WARNING), bus, text))
