@@ -71,6 +71,16 @@ _STIFFNESS = Parameter(
 )
 _DAMPING = Parameter("damping_Nms_rad", "N·m·s/rad", 0.0, _ANY, 5.0, "torque per speed of twist", "inertia")
 
+_MOTOR_INERTIA = Parameter(
+    "motor_inertia_kgm2",
+    "kg·m²",
+    0.0,
+    _ANY,
+    0.0,
+    "inertia before the spring; taken from the link where it is more than the file's rotor. 0: the file's rotor, or a"
+    " quarter of the link where the file has none",
+)
+
 EFFECT_KINDS: dict[Effect, Kind] = {
     "friction.stribeck": Kind(
         "joint",
@@ -155,6 +165,7 @@ EFFECT_KINDS: dict[Effect, Kind] = {
             _STIFFNESS,
             _DAMPING,
             Parameter("cubic_Nm_rad3", "N·m/rad³", 0.0, 1e18, 0.0, "hardening: torque per third power of twist"),
+            _MOTOR_INERTIA,
         ),
     ),
     "transmission.backlash": Kind(
@@ -164,6 +175,7 @@ EFFECT_KINDS: dict[Effect, Kind] = {
             Parameter("gap_rad", "rad", 0.0, 1.0, 1e-3, "free travel from flank to flank", "range"),
             msgspec.structs.replace(_STIFFNESS, default=90000.0),
             msgspec.structs.replace(_DAMPING, default=30.0),
+            _MOTOR_INERTIA,
         ),
     ),
     "transmission.efficiency": Kind(

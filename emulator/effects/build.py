@@ -31,8 +31,9 @@ def physics(present: Present, body: Body, period_s: float, substeps: int, q: Flo
     """
     robot = present.robot
     h = period_s / substeps
-    chain, base = _chain(present, body, q)
-    shafts = _shafts(present, len(base.stiffness))
+    rotors, link = _split(present, body)
+    chain, base = _chain(present, body, link, q)
+    shafts = _shafts(present, rotors, len(base.stiffness))
     rows, brake_row = _rows(present, body, shafts, len(base.stiffness), h)
     return Physics(
         chain=chain,
@@ -94,15 +95,39 @@ def initial(physics: Physics, power: Power, q: Floats, substeps: int, ambient_C:
     return state, memory
 
 
-def _chain(present: Present, body: Body, q: Floats) -> tuple[Chain, Base]:
+def _chain(present: Present, body: Body, link: Floats, q: Floats) -> tuple[Chain, Base]:
     plain = Geometry(body.R0, body.p0, body.prismatic, body.gravity)
     for entry in present.of("base.flexibility"):
         p = entry.parameters
-        return flexible(plain, body.link, q, p["frequency_Hz"], p["damping"], p["inertia_kgm2"], p["height_m"])
-    return rigid(plain, body.link)
+        return flexible(plain, link, q, p["frequency_Hz"], p["damping"], p["inertia_kgm2"], p["height_m"])
+    return rigid(plain, link)
 
 
-def _shafts(present: Present, first: int) -> Shafts:
+def _split(present: Present, body: Body) -> tuple[Floats, Floats]:
+    """Inertia before and behind the springs: of all motors, shape (J,), and the links, shape (J, 10).
+
+    Motor and link of a rigid axis cannot be told apart, so a file may give their sum to the link.
+
+    Raises:
+        ConfigError: Nothing is left for one of the two.
+    """
+    robot, link = present.robot, body.link.copy()
+    rotors = np.array([joint.parameters.rotor_inertia_kgm2 for joint in robot.joint])
+    for entry in (e for key in _TRANSMISSIONS for e in present.of(key)):
+        j = present.joint(entry)
+        column = 0 if body.prismatic[j] else 9  # mass, or zz
+        before = entry.parameters["motor_inertia_kgm2"] or rotors[j] or link[j, column] / 4
+        link[j, column] -= before - rotors[j]
+        rotors[j] = before
+        if before <= 0 or link[j, column] < 0:
+            raise ConfigError(
+                f"{robot.name}: {entry.effect}@{entry.joint}: {before:g} kg·m² before the spring would leave"
+                f" {link[j, column]:g} kg·m² behind it. Give another motor_inertia_kgm2."
+            )
+    return rotors, link
+
+
+def _shafts(present: Present, rotors: Floats, first: int) -> Shafts:
     """Elasticity and backlash of one axis are springs in series."""
     robot = present.robot
     J, C = robot.joints, robot.coupling_matrix()
@@ -114,19 +139,13 @@ def _shafts(present: Present, first: int) -> Shafts:
         twist[e, first : first + J] = -C[j]
         twist[e, first + J + e] = 1.0
         of_motor[j] = e
-        if robot.joint[j].parameters.rotor_inertia_kgm2 <= 0:
-            raise ConfigError(
-                f"{robot.name}: {robot.joint_names[j]} has no rotor_inertia_kgm2; a motor before an elastic"
-                " transmission needs one."
-            )
-
     soft = [1 / present.by_joint(key, "stiffness_Nm_rad", np.inf)[motors] for key in _TRANSMISSIONS]
     damping = [present.by_joint(key, "damping_Nms_rad")[motors] for key in _TRANSMISSIONS]
     return Shafts(
         motor=np.array(motors, dtype=np.int64),
         rotor=np.arange(first + J, first + J + E, dtype=np.int64),
         twist=twist,
-        inertia=np.array([robot.joint[j].parameters.rotor_inertia_kgm2 for j in motors], dtype=float),
+        inertia=rotors[motors],
         stiffness=1 / np.sum(soft, axis=0),
         cubic=present.by_joint("transmission.elasticity", "cubic_Nm_rad3")[motors],
         damping=np.sum(damping, axis=0),
@@ -266,7 +285,7 @@ def _sensing(present: Present, h: float) -> Sensing:
     return Sensing(
         offset_A=present.by_joint("drive.current_offset", "offset_A"),
         delay=present.by_joint("drive.delay", "delay_s") / h,
-        smoothing=1 - np.exp(-h / np.maximum(filter_s, 1e-12)),
+        smoothing=h / (h + filter_s),  # a pole whose delay is filter_s, sampled as it is
         disc=disc,
         disc_per_rad=per_rad,
         disc_phase=present.by_joint("sensor.eccentricity", "phase_rad"),
