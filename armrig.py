@@ -52,6 +52,13 @@ EffectOption = Annotated[
         "--effect", metavar="KEY@JOINT:name=value", help="Physics beyond the machine file, such as spring@joint3."
     ),
 ]
+FaultOption = Annotated[
+    list[str] | None,
+    typer.Option("--fault", metavar="KIND@PLACE:t=S", help="What goes wrong, such as heartbeat-loss@joint3:t=5."),
+]
+TimingOption = Annotated[
+    str, typer.Option("--bus-timing", help="ideal: frames take no time; true: lengths, arbitration and load of CAN.")
+]
 DurationOption = Annotated[float | None, typer.Option("--duration", metavar="S", min=0.0, help="Stop after so long.")]
 JsonOption = Annotated[
     str | None,
@@ -151,6 +158,16 @@ def emulated(rig: "Rig", robot: "Robot", rig_name: str, seed: int | None, effect
     return EmulatedRig(rig, load_machine(rig, robot, locate(rig_name).parent))
 
 
+def schedule(rig: "EmulatedRig", faults: Sequence[str]) -> None:
+    """Faults of drives; those of buses belong to the wires."""
+    from emulator.disturbance import is_disturbance
+    from emulator.faults import parse_fault
+
+    for text in faults:
+        if not is_disturbance(text):
+            rig.schedule(parse_fault(text))
+
+
 def idle(joints: int) -> "tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]":
     """What a plant is told of drives that are off."""
     import numpy as np
@@ -177,6 +194,8 @@ def emulate(
     duration: DurationOption = None,
     seed: Annotated[int | None, typer.Option(help="Of everything random; the rig file's otherwise.")] = None,
     effect: EffectOption = None,
+    fault: FaultOption = None,
+    bus_timing: TimingOption = "ideal",
 ) -> None:
     """Emulate a rig: its drives on CAN, the arm behind them, the cell on Modbus/TCP.
 
@@ -184,14 +203,17 @@ def emulate(
     run in lock-step and the buses are written to stdout as candump text, for `armrig record RIG --bus -`.
     """
     if clock == "sim":
-        simulate(rig, motion, seed, effect or [])
+        simulate(rig, motion, seed, effect or [], fault or [], bus_timing)
     elif clock == "real":
-        emulate_on_buses(rig, bus or [], duration, seed, effect or [])
+        emulate_on_buses(rig, bus or [], duration, seed, effect or [], fault or [], bus_timing)
     else:
         raise ConfigError(f"--clock {clock}: choose real or sim.")
 
 
-def simulate(rig_name: str, motion: str | None, seed: int | None, effects: Sequence[str]) -> None:
+def simulate(
+    rig_name: str, motion: str | None, seed: int | None, effects: Sequence[str], faults: Sequence[str], timing: str
+) -> None:
+    from emulator.bustiming import wires
     from emulator.host import Host
     from emulator.lockstep import lockstep
     from protocols.candump import format_frame
@@ -201,7 +223,9 @@ def simulate(rig_name: str, motion: str | None, seed: int | None, effects: Seque
     rig, robot = load(rig_name)
     report_loads(rig)
     host = Host(rig, robot, load_motion(motion))
+    wire = wires(rig, timing, faults)
     cell = emulated(rig, robot, rig_name, seed, effects)
+    schedule(cell, faults)
     names = [b.name for b in rig.bus]
     write = sys.stdout.write
 
@@ -211,7 +235,7 @@ def simulate(rig_name: str, motion: str | None, seed: int | None, effects: Seque
 
     begin = RealTime()
     with stopping() as stop:
-        simulated_ns = lockstep(cell, host, rig.sync_period_us * 1000, tap, stop.is_set)
+        simulated_ns = lockstep(cell, host, rig.sync_period_us * 1000, tap, stop.is_set, list(wire.values()) or None)
     sys.stdout.flush()
     log(f"{simulated_ns * 1e-9:.1f} s simulated in {begin.seconds:.1f} s: {simulated_ns * 1e-9 / begin.seconds:.1f}x")
 
@@ -230,8 +254,15 @@ class RealTime:
 
 
 def emulate_on_buses(
-    rig_name: str, moved: Sequence[str], duration: float | None, seed: int | None, effects: Sequence[str]
+    rig_name: str,
+    moved: Sequence[str],
+    duration: float | None,
+    seed: int | None,
+    effects: Sequence[str],
+    faults: Sequence[str],
+    timing: str,
 ) -> None:
+    from emulator import bustiming
     from emulator.bus import open_bus
     from emulator.cell import CellServer
     from emulator.hubprocess import HubProcess
@@ -241,12 +272,14 @@ def emulate_on_buses(
 
     rig, robot = load(rig_name, moved)
     report_loads(rig)
+    wires = bustiming.served(rig, timing, faults)
     arm = emulated(rig, robot, rig_name, seed, effects)
+    schedule(arm, faults)
     scratch = emulated(rig, robot, rig_name, seed, effects)
     scratch.plant.advance(*idle(robot.joints))  # compiles what is not cached yet, before anyone relies on the rig
     with ExitStack() as stack:
         served = [(b.name, b.channel) for b in rig.bus if b.interface == "virtualcan"]
-        channels = stack.enter_context(HubProcess(served)).channels if served else {}
+        channels = stack.enter_context(HubProcess(served, wires)).channels if served else {}
         opened = [msgspec.structs.replace(b, channel=channels.get(b.name, b.channel)) for b in rig.bus]
         buses = [stack.enter_context(open_bus(b)) for b in opened]
         stop = stack.enter_context(stopping())
@@ -444,7 +477,10 @@ def export(
 
 # --- identification ---
 
-MethodOption = Annotated[str, typer.Option("--method", metavar="M[,M...]", help="ols, wls.")]
+MethodOption = Annotated[
+    str,
+    typer.Option("--method", metavar="M[,M...]", help="ols, wls, iv, cloe, didim, irls, tls, ml, ekf, setmembership."),
+]
 ValidateOption = Annotated[
     list[str] | None, typer.Option("--validate", metavar="RUN.mcap", help="Recording to judge by, not to fit.")
 ]
@@ -549,6 +585,26 @@ def deliver(
 
 ConnectOption = Annotated[str, typer.Option("--connect", metavar="EP", help="Zenoh endpoint of the service.")]
 ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+@app.command()
+def compare(
+    recording: Annotated[Path, typer.Argument(metavar="RUN.mcap")],
+    robots: Annotated[list[str], typer.Argument(metavar="ROBOT_A.toml ROBOT_B.toml...")],
+    json: JsonOption = None,
+) -> None:
+    """Which robot file describes a recorded machine better: as inverse model and simulated in closed loop."""
+    from ident.compare import compare as run
+    from ident.compare import show, to_json
+    from protocols.robot import load as load_robot
+
+    found = run(recording, [(Path(name).stem, load_robot(name)) for name in robots])
+    if json == "-":
+        sys.stdout.write(to_json(found).decode())
+        return
+    show(found)
+    if json:
+        Path(json).write_bytes(to_json(found))
 
 
 @app.command()
