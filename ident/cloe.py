@@ -21,33 +21,49 @@ from ident.auxiliary import Run
 from ident.contract import Iterate
 from ident.covariance import HAC, Covariance, Moments
 from ident.estimate import Estimate, assemble, joint_rows, joint_sigma, joint_triangles, refuse_deficient
-from ident.iteration import Criterion, regular_start
+from ident.iteration import regular_start
 from ident.observation import Observation
 from ident.problem import Problem
-from ident.system import Solution, System, triangle
+from ident.system import System, triangle
 from protocols.errors import IdentificationError
 
 Array = NDArray[np.float64]
 
 ROWS_HZ = 100.0  # positions are averaged to this rate: ten times the bandwidth of the motion
 SETTLED_S = 0.5  # after the start; when each drive was switched on, and the arm sank into its law, is not known exactly
-HALVINGS = 5  # of a step that does not reduce the output error
-GAUSS_NEWTON = Criterion(residual=1e-3, parameters=0.01, deviations=0.1, iterations=30)
+CLOSE, NEAR = 0.1, 1.0  # radii of the confidence region
+
+
+@dataclass(frozen=True)
+class _Point:
+    """An iteration: parameters, their simulation, and how far it is from the recording."""
+
+    beta: Array
+    simulated: list[list[Simulation]]
+    iterate: Iterate
+    norm: float
 
 
 @dataclass(frozen=True)
 class Cloe:
     """CLOE.
 
+    It has converged within a tenth of a radius of the confidence region from the best parameters, or within one where
+    the output error does not fall any more: dry friction makes its last digits uneven.
+
     Attributes:
         start: `prior`, the parameters of the robot file, or `regular`, eq. (24).
         covariance: How the standard deviations are made.
-        criterion: Convergence.
+        iterations: Most.
+        halvings: Of a step that does not reduce the output error; 0 for the plain Gauss-Newton of the paper.
+        settled: Relative fall of the output error that is none.
     """
 
     start: Literal["prior", "regular"] = "prior"
     covariance: Covariance = HAC
-    criterion: Criterion = GAUSS_NEWTON
+    iterations: int = 30
+    halvings: int = 5
+    settled: float = 1e-3
     name: str = "CLOE"
 
     def fit(self, problem: Problem) -> Estimate:
@@ -58,47 +74,48 @@ class Cloe:
             IdentificationError: The start cannot be simulated, no step reduces the error, or the iteration does not
                 converge; says what to do.
         """
-        base, criterion = problem.base, self.criterion
         runs = auxiliary.runs(problem.signals)
-        standard = regular_start(problem.model) if self.start == "regular" else problem.model.theta(problem.model.robot)
-        beta = base.B @ standard
+        start = regular_start(problem.model) if self.start == "regular" else problem.model.theta(problem.model.robot)
         try:
-            simulated = _simulate(problem, runs, beta)
+            point = _simulate(problem, runs, problem.base.B @ start)
         except IdentificationError as error:
             raise IdentificationError(f"{self.name}, start: {error}") from error
-        history = [_iterate(runs, simulated, beta)]
-        converged = False
-        while not converged:
-            if len(history) > criterion.iterations:
-                raise IdentificationError(self._lost(problem, history, "it has not settled"))
-            rows = _output_rows(problem, runs, simulated, beta)
-            solution, _, _ = _solve(rows, problem)
-            target, stepped = solution.beta, None
-            for halving in range(HALVINGS + 1):
-                wanted = beta + (target - beta) / 2**halving
-                stepped = self._try(problem, runs, wanted, history[-1])
-                if stepped is not None:
-                    break
-            if stepped is None:
+        history, fall = [point.iterate], float("inf")
+        while True:
+            rows = _output_rows(problem, runs, point)
+            triangles = joint_triangles(rows)
+            try:
+                refuse_deficient(triangle(triangles)[:, :-1], problem.base, rows)
+            except IdentificationError as error:
+                raise IdentificationError(
+                    self._lost(problem, history, "positions do not show the parameters")
+                ) from error
+            sigma = joint_sigma(triangles, joint_rows(rows))
+            system = System.of_triangle(triangle([t / s for t, s in zip(triangles, sigma, strict=True)]))
+            away = _offset(system, point.beta)
+            if away <= CLOSE or (away <= NEAR and fall <= self.settled):
+                return self._estimate(problem, rows, point.beta, history, system, sigma)
+            if len(history) > self.iterations:
+                raise IdentificationError(self._lost(problem, history, f"no convergence (still {away:.2g} radii away)"))
+            better = self._step(problem, runs, point, system.solve().beta)
+            if better is None and away <= NEAR:
+                return self._estimate(problem, rows, point.beta, history, system, sigma)
+            if better is None:
                 raise IdentificationError(self._lost(problem, history, "no step reduces the output error"))
-            change = criterion.change(wanted, beta, solution.std)
-            now, before = stepped[1].residual_norm or 0.0, history[-1].residual_norm or 0.0
-            converged = halving == 0 and criterion.met(change, now, before)
-            beta, simulated = wanted, stepped[0]
-            history.append(stepped[1])
-        return self._estimate(problem, _output_rows(problem, runs, simulated, beta), beta, history)
+            fall = 1 - better.norm / point.norm
+            point = better
+            history.append(point.iterate)
 
-    def _try(
-        self, problem: Problem, runs: Sequence[Run], beta: Array, last: Iterate
-    ) -> tuple[list[list[Simulation]], Iterate] | None:
-        """Simulations at beta; None where it cannot be simulated or is further from the recording than before."""
-        try:
-            simulated = _simulate(problem, runs, beta)
-        except IdentificationError:
-            return None
-        iterate = _iterate(runs, simulated, beta)
-        worse = (iterate.residual_norm or 0.0) > (1 + self.criterion.residual) * (last.residual_norm or 0.0)
-        return None if worse else (simulated, iterate)
+    def _step(self, problem: Problem, runs: Sequence[Run], point: _Point, target: Array) -> _Point | None:
+        """A point on the way to the target that can be simulated and is not further from the recording."""
+        for halving in range(self.halvings + 1):
+            try:
+                found = _simulate(problem, runs, point.beta + (target - point.beta) / 2**halving)
+            except IdentificationError:
+                continue
+            if found.norm <= (1 + self.settled) * point.norm:
+                return found
+        return None
 
     def _lost(self, problem: Problem, history: Sequence[Iterate], why: str) -> str:
         errors = ", ".join(
@@ -112,11 +129,20 @@ class Cloe:
         )
 
     def _estimate(
-        self, problem: Problem, rows: Sequence[Observation], beta: Array, history: Sequence[Iterate]
+        self,
+        problem: Problem,
+        rows: Sequence[Observation],
+        beta: Array,
+        history: Sequence[Iterate],
+        system: System,
+        sigma: Array,
     ) -> Estimate:
-        solution, sigma, system = _solve(rows, problem)
-        white = solution.inverse @ solution.inverse.T
-        covariance, words = self.covariance.of(Moments.weighted(rows, beta, sigma, white))
+        """
+        Args:
+            rows, system, sigma: Linearised output at beta, and the deviations of positions [rad].
+        """
+        inverse = system.solve().inverse
+        covariance, words = self.covariance.of(Moments.weighted(rows, beta, sigma, inverse @ inverse.T))
         return assemble(
             problem.observations,
             problem.base,
@@ -124,7 +150,7 @@ class Cloe:
             beta,
             covariance=covariance,
             covariance_name=f"{words}; of positions",
-            white=white,
+            white=inverse @ inverse.T,
             sigma_Nm=joint_sigma(problem.triangles, joint_rows(problem.observations)),
             system=system,
             triangles=problem.triangles,
@@ -133,24 +159,31 @@ class Cloe:
         )
 
 
-def _simulate(problem: Problem, runs: Sequence[Run], beta: Array) -> list[list[Simulation]]:
-    return auxiliary.simulate(runs, problem.model, auxiliary.standard(problem.base, beta), update_gains=False)
+def _offset(system: System, beta: Array) -> float:
+    """How far beta is from the best, in radii of the confidence region: Bates & Watts 1981 (Technometrics 23, 179-183).
+
+    Below a tenth there is nothing left to gain, whatever dry friction does to the last digits of a simulation.
+    """
+    along = np.linalg.qr(system.W)[0].T @ (system.y - system.W @ beta)  # rows are weighted to unit variance
+    return float(np.linalg.norm(along) / np.sqrt(len(beta)))
 
 
-def _iterate(runs: Sequence[Run], simulated: Sequence[Sequence[Simulation]], beta: Array) -> Iterate:
+def _simulate(problem: Problem, runs: Sequence[Run], beta: Array) -> _Point:
+    standard = auxiliary.standard(problem.base, beta)
+    simulated = auxiliary.simulate(runs, problem.model, standard, update_gains=False)
     square = sum(
         float(np.sum((run.signals.q[stretch.rows][stretch.lead :] - simulation.q) ** 2))
         for run, stretches in zip(runs, simulated, strict=True)
         for stretch, simulation in zip(run.stretches, stretches, strict=True)
     )
-    return Iterate(beta.tolist(), auxiliary.position_error_percent(runs, simulated).tolist(), float(np.sqrt(square)))
+    norm = float(np.sqrt(square))
+    iterate = Iterate(beta.tolist(), auxiliary.position_error_percent(runs, simulated).tolist(), norm)
+    return _Point(beta, simulated, iterate, norm)
 
 
-def _output_rows(
-    problem: Problem, runs: Sequence[Run], simulated: Sequence[Sequence[Simulation]], beta: Array
-) -> list[Observation]:
+def _output_rows(problem: Problem, runs: Sequence[Run], point: _Point) -> list[Observation]:
     """Linearised output: q - qs + S beta = S beta' + error, averaged to `ROWS_HZ`; one observation per recording."""
-    return [_output(problem, run, stretches, beta) for run, stretches in zip(runs, simulated, strict=True)]
+    return [_output(problem, run, simulated, point.beta) for run, simulated in zip(runs, point.simulated, strict=True)]
 
 
 def _output(problem: Problem, run: Run, simulated: Sequence[Simulation], beta: Array) -> Observation:
@@ -182,12 +215,3 @@ def _output(problem: Problem, run: Run, simulated: Sequence[Simulation], beta: A
         bandwidth_Hz=ROWS_HZ / 2,
         notes=[],
     )
-
-
-def _solve(rows: Sequence[Observation], problem: Problem) -> tuple[Solution, Array, System]:
-    """Next parameters, deviations of the positions per joint [rad], and the system."""
-    triangles = joint_triangles(rows)
-    refuse_deficient(triangle(triangles)[:, :-1], problem.base, rows)
-    sigma = joint_sigma(triangles, joint_rows(rows))
-    system = System.of_triangle(triangle([t / s for t, s in zip(triangles, sigma, strict=True)]))
-    return system.solve(), sigma, system

@@ -61,16 +61,24 @@ class System:
         return self.W if self.Z is None else self.Z
 
     def solve(self, kept: NDArray[np.bool_] | None = None) -> Solution:
-        """Solution with some parameters only, the others zero; covariance by eq. (8), for instruments inv(Z'Z)."""
+        """Solution with some parameters only, the others zero; covariance by eq. (8), for instruments inv(Z'Z).
+
+        With fewer parameters than instruments, two-stage least squares: the values whose residual is least on the
+        instruments. Only that part is added to `rest`. What errors of W in the dropped columns do to the whole residual
+        says nothing of the parameters; for least squares both are the same.
+        """
         b = self.W.shape[1]
         kept = np.ones(b, dtype=bool) if kept is None else kept
-        W = self.W[:, kept]
-        Q, R = linalg.qr(self.instruments[:, kept], mode="economic", check_finite=False)
+        Q, R = linalg.qr(self.instruments, mode="economic", check_finite=False)
+        A, c = (R if self.Z is None else Q.T @ self.W), Q.T @ self.y
+        q, r = linalg.qr(A[:, kept], mode="economic", check_finite=False)
         beta, inverse = np.zeros(b), np.zeros((b, b))
-        # R'Q'W beta = R'Q'y; for least squares Q'W = R
-        beta[kept] = linalg.solve_triangular(R, Q.T @ self.y) if self.Z is None else linalg.solve(Q.T @ W, Q.T @ self.y)
-        inverse[np.ix_(kept, kept)] = linalg.solve_triangular(R, np.eye(int(kept.sum())))
-        return Solution(beta, inverse, float(np.sum((self.y - W @ beta[kept]) ** 2)))
+        beta[kept] = linalg.solve_triangular(r, q.T @ c)
+        root = linalg.qr(R[:, kept], mode="r", check_finite=False)[0][: kept.sum()]
+        inverse[np.ix_(kept, kept)] = linalg.solve_triangular(root, np.eye(len(root)))
+        whole = beta if kept.all() else linalg.solve(A, c)
+        rest = float(np.sum((self.y - self.W @ whole) ** 2) + np.sum((c - A @ beta) ** 2))
+        return Solution(beta, inverse, rest)
 
 
 def triangle(blocks: Sequence[Array]) -> Array:
