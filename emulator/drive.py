@@ -297,7 +297,7 @@ class Drive:
         target = None if command is None else TRANSITIONS.get((self.state, command))
         if target is not None and self._allows(command, target):
             self._enter(target)
-        elif self.state is State.OPERATION_ENABLED and self._mode is not None:
+        elif self.state is State.OPERATION_ENABLED and self._mode is not None and self._stop is None:
             self._mode.control(word, before)
 
     def _allows(self, command: cia402.Command | None, target: State) -> bool:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from emulator.axis import Measurement
 from emulator.drive import Drive
-from protocols import cia402, emcy, nmt, sdo
+from protocols import cia402, emcy, lss, nmt, sdo, sdoblock
 from protocols.dictionary import drive_dictionary
 from protocols.frames import ERROR, EXTENDED, REMOTE, Frame
 from protocols.objects import Type
@@ -19,9 +19,17 @@ DICTIONARY = drive_dictionary(CONFIG)
 NODE = 5
 MS = 1_000_000
 
+IDENTITY = lss.Identity(0, 0x4152_4D52, 0x0001_0000, NODE)
+BLOCKS = [  # both directions of a block transfer, out of order as drawn
+    sdoblock.BlockDownload(0x2000, 0, b"x").request(),
+    sdoblock.BlockUpload(0x1008).request(),
+    sdoblock.BlockUpload(0x2041).request(),
+    *(bytes((first, 1, 5)).ljust(8, b"\0") for first in (0xA3, 0xA2, 0xA1, 0x81, 0x01, 0xD9, 0xC1)),
+]
+
 addresses = st.sampled_from([(e.index, e.sub) for e in DICTIONARY.entries.values()])
 anything = st.binary(max_size=8)
-words = st.sampled_from([0x00, 0x02, 0x06, 0x07, 0x0F, 0x80, 0x8F, 0x100])
+words = st.sampled_from([0x00, 0x02, 0x06, 0x07, 0x0F, 0x1F, 0x3F, 0x5F, 0x80, 0x8F, 0x100, 0x10F, 0x11F])
 
 
 @st.composite
@@ -41,7 +49,11 @@ frames = st.one_of(
     st.builds(lambda a: Frame(0x600 + NODE, sdo.Upload(*a).request()), addresses),
     st.builds(lambda d: Frame(0x600 + NODE, d), anything),
     st.builds(nmt.command, st.sampled_from(nmt.Command), st.sampled_from([0, NODE, 6])),
-    st.builds(lambda w, m: Frame(0x200 + NODE, struct.pack("<Hb", w, m)), words, st.sampled_from([0, 8, 10, 9])),
+    st.builds(lambda w, m: Frame(0x200 + NODE, struct.pack("<Hb", w, m)), words, st.integers(-1, 11)),
+    st.builds(lambda d: Frame(0x600 + NODE, d), st.sampled_from(BLOCKS)),
+    st.builds(lambda i: Frame(i | REMOTE, b"", 8), st.sampled_from([0x180 + NODE, 0x380 + NODE, 0x700 + NODE])),
+    st.builds(lambda d: Frame(nmt.TIME, d), anything),
+    st.sampled_from([*lss.select(IDENTITY), *(lss.message(s) for s in lss.Service if s > lss.Service.SWITCHED)]),
     st.builds(lambda d: Frame(0x300 + NODE, d), anything),
     st.builds(lambda n, d: Frame(0x700 + n, d), st.sampled_from([NODE, 127]), anything),
     st.builds(
