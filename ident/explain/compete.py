@@ -17,7 +17,7 @@ DRAWS = 40  # simulated healthy recordings
 LEVEL = 0.99  # of them stay below the threshold
 LEAST_NATS = 10.0  # threshold at least: model errors at reversals are not in the simulated recordings
 CHAIN = 0.04  # share of the gain explained so far that one more effect must bring: forms are never exact
-MOST = 5  # effects
+MOST = 5  # effects on one joint
 ABSTAIN_RATIO, ABSTAIN_NATS = 1.25, 6.0  # by which a rival without physics must win
 LOOK_AHEAD = 6  # effects that are tried as the first of a pair
 WIDE = 1e-6  # precision of an accepted effect's coefficient against its own columns
@@ -102,49 +102,68 @@ class Competition:
         out = [candidates.best_of(self.scene, stage, b) for b in self.batches]
         return [ranked for ranked, _ in out], np.array([gain for _, gain in out])
 
-    def scan(self, stage: Stage) -> list[Ranked]:
-        """Best candidate of every effect and joint, best first."""
-        return _merged(self._scan(stage)[0])
+    def scan(self, stage: Stage, joints: set[int] | None = None) -> list[Ranked]:
+        """Best candidate of every effect and joint, best first; of some joints and the whole arm only, or of all."""
+        wanted = [b for b in self.batches if joints is None or _touches(b.candidates[0], joints)]
+        return _merged([candidates.best_of(self.scene, stage, b)[0] for b in wanted])
 
     def run(self) -> Outcome:
         """The whole selection."""
         accepted: list[Ranked] = []
         unlisted: Ranked | None = None
         ranking = _merged(self.opening)
-        explained = 0.0
-        while len(accepted) < MOST:
-            stage = self.stage(accepted) if accepted else self.stage([])
-            if accepted:
-                ranking = self.scan(stage)
-            named, rival = _split(ranking)
-            best = candidates.refined(self.scene, stage, named[0])
-            least = max(self.null.named, CHAIN * explained)
-            if rival and self._abstains(rival[0], best, explained):
-                pair = self._pair(accepted, named, rival[0])
+        J = self.scene.joints
+        explained = np.zeros(J)
+        while len(accepted) < MOST + 2 * (J - 1):
+            stage = self.stage(accepted)
+            if accepted:  # what other joints have to gain hardly changed
+                changed = set(accepted[-1].candidate.joints) or set(range(J))
+                others = [r for r in ranking if not _touches(r.candidate, changed)]
+                ranking = _merged([*self.scan(stage, changed), *others])
+            crowded = {j for j in range(J) if sum(j in a.candidate.joints for a in accepted) >= MOST}
+            open_ = [r for r in ranking if not set(r.candidate.joints) & crowded and self._enough(r, explained)]
+            named, rival = _split(open_)
+            best = candidates.refined(self.scene, stage, named[0]) if named else None
+            if rival and self._abstains(rival[0], ranking, stage):
+                pair = self._pair(accepted, _split(ranking)[0], rival[0])
                 if pair is None:
                     unlisted = rival[0]
                     break
                 best = pair
-            if best.gain < least:
+            if best is None or best.gain < self.null.named:
                 break
             accepted.append(best)
-            explained += best.gain
+            for j in best.candidate.joints or range(J):
+                explained[j] += best.gain
         accepted = self._swapped(self._backward(accepted))
-        scans = [self.scan(self.stage(accepted[:i] + accepted[i + 1 :])) for i in range(len(accepted))]
+        scans = [self._rivals_of(accepted, i) for i in range(len(accepted))]
         return Outcome(accepted, scans, unlisted, self.null, self.stage(accepted), self.first, ranking)
 
-    def _abstains(self, rival: Ranked, best: Ranked, explained: float) -> bool:
-        if rival.gain < max(self.null.rival, CHAIN * explained):
-            return False
-        return rival.gain > ABSTAIN_RATIO * max(best.gain, 0.0) + ABSTAIN_NATS
+    def _rivals_of(self, accepted: list[Ranked], i: int) -> list[Ranked]:
+        joints = set(accepted[i].candidate.joints) or None
+        return self.scan(self.stage(accepted[:i] + accepted[i + 1 :]), joints)
+
+    def _enough(self, r: Ranked, explained: Array) -> bool:
+        """Above what chance gives, and not a mere correction of the form of what was accepted on the joint before."""
+        before = max((explained[j] for j in r.candidate.joints), default=float(explained.max(initial=0.0)))
+        least = self.null.named if r.candidate.named else self.null.rival
+        return bool(r.gain >= max(0.7 * least if r.candidate.named else least, CHAIN * before))
+
+    def _abstains(self, rival: Ranked, ranking: Sequence[Ranked], stage: Stage) -> bool:
+        """A rival beats every named effect on its joint (and of the whole arm), refined."""
+        named = [r for r in ranking if r.candidate.named and _touches(r.candidate, set(rival.candidate.joints))]
+        best = max((candidates.refined(self.scene, stage, r).gain for r in named[:2]), default=0.0)
+        return rival.gain > ABSTAIN_RATIO * max(best, 0.0) + ABSTAIN_NATS
 
     def _pair(self, accepted: list[Ranked], named: Sequence[Ranked], rival: Ranked) -> Ranked | None:
         """First of two effects that together do as well as the rival; None if no two do."""
         best: tuple[float, Ranked] | None = None
-        for first in [r for r in named if r.gain > 0.5 * self.null.named][:LOOK_AHEAD]:
+        where = set(rival.candidate.joints)
+        able = [r for r in named if r.gain > 0.3 * self.null.named and _touches(r.candidate, where)]
+        for first in able[:LOOK_AHEAD]:
             sharp = candidates.refined(self.scene, self.stage(accepted), first)
             stage = self.stage([*accepted, sharp])
-            second = _split(self.scan(stage))[0][0]
+            second = _split(self.scan(stage, where))[0][0]
             if second.gain < self.null.named:
                 continue
             total = sharp.gain + second.gain
@@ -178,7 +197,7 @@ class Competition:
         for i in range(len(kept)):
             stage = self.stage(kept[:i] + kept[i + 1 :])
             here = self._rescored(stage, kept[i])
-            named = _split(self.scan(stage))[0]
+            named = _split(self.scan(stage, set(here.candidate.joints) or None))[0]
             rival = candidates.refined(self.scene, stage, named[0])
             if rival.candidate.key != here.candidate.key and rival.gain > here.gain + 2.0:
                 kept[i] = rival
@@ -197,6 +216,11 @@ class Competition:
             ratio = (self.first.residual(j)[:, 1:] ** 2).sum(axis=0) / rows
             out.append(float(ratio.mean() + 3 * ratio.std()) if weight.any() else 1.0)
         return np.array(out)
+
+
+def _touches(candidate: Candidate, joints: set[int]) -> bool:
+    """Of one of the joints, or of the whole arm."""
+    return candidate.hypothesis.whole or bool(set(candidate.joints) & joints)
 
 
 def excess_ratio(scene: Scene, stage: Stage) -> Array:

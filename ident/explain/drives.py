@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ident.explain.contract import Parameter
@@ -10,6 +11,8 @@ from ident.explain.hypothesis import Flags, Hypothesis, Theta, gear, parameter, 
 from ident.explain.scene import Scene, View
 
 Array = NDArray[np.float64]
+
+EARLIEST_S, LATEST_S = -0.02, 0.05  # a commanded current is ahead of the torque, a measured one behind
 
 
 class CurrentOffset(Hypothesis):
@@ -60,7 +63,7 @@ class Delay(Hypothesis):
         return -_rate(view.total[:, [joint]], view)
 
     def plausible(self, scene: Scene, joint: int, theta: Theta, c: Array) -> Flags:
-        return within(c, 0.0, 0.05)
+        return within(c, EARLIEST_S, LATEST_S)
 
     def parameters(self, scene: Scene, joint: int, theta: Theta, c: Array, std: Array) -> list[Parameter]:
         return [parameter(scene, joint, self.effect, "delay_s", c[0], std[0])]
@@ -107,7 +110,10 @@ class Saturation(Hypothesis):
 
 
 class Ripple(Hypothesis):
-    """Torque harmonics of the motor's angle. Orders come from the scan at full bandwidth (`explain.ripple`)."""
+    """Torque harmonics of the motor's angle. Orders come from the scan at full bandwidth (`explain.ripple`).
+
+    theta holds "order", and for a series of harmonics "order2", "order3", ... besides.
+    """
 
     effect = "motor.ripple"
     group = "ripple"
@@ -118,21 +124,35 @@ class Ripple(Hypothesis):
         return []
 
     def columns(self, scene: Scene, view: View, joint: int, theta: Theta) -> Array:
-        angle = theta["order"] * gear(scene, joint) * view.motion.q[:, joint]
-        return np.column_stack([np.sin(angle), np.cos(angle)])
+        return harmonics(view.motion.q[:, joint] * gear(scene, joint), theta)
 
     def parameters(self, scene: Scene, joint: int, theta: Theta, c: Array, std: Array) -> list[Parameter]:
-        amplitude = float(np.hypot(c[0], c[1]))
-        spread = float(np.hypot(*std) / np.sqrt(2))
-        sign = np.sign(scene.model.robot.joint[joint].drive.gear_ratio)
-        phase = float(np.arctan2(c[1], c[0]) * sign)
-        if sign < 0:
-            phase = float(np.arctan2(c[1], -c[0]))
-        return [
-            parameter(scene, joint, self.effect, "amplitude_Nm", amplitude, spread),
-            parameter(scene, joint, self.effect, "order", theta["order"], 0.0),
-            parameter(scene, joint, self.effect, "phase_rad", phase, spread / max(amplitude, 1e-12)),
-        ]
+        sign = np.sign(scene.model.robot.joint[joint].drive.gear_ratio)  # the motor may turn against its joint
+        out: list[Parameter] = []
+        for k, order in enumerate(theta.values()):
+            sine, cosine = c[2 * k], c[2 * k + 1]
+            amplitude = float(np.hypot(sine, cosine))
+            spread = float(np.hypot(std[2 * k], std[2 * k + 1]) / np.sqrt(2))
+            number = "" if k == 0 else f"#{k + 1}"  # of the harmonic; robot files get an entry for each
+            for p in (
+                parameter(scene, joint, self.effect, "amplitude_Nm", amplitude, spread),
+                parameter(scene, joint, self.effect, "order", order, 0.0),
+                parameter(
+                    scene,
+                    joint,
+                    self.effect,
+                    "phase_rad",
+                    float(np.arctan2(cosine, sign * sine)),
+                    spread / max(amplitude, 1e-12),
+                ),
+            ):
+                out.append(replace(p, name=p.name + number))
+        return out
+
+    def because(self, scene: Scene, joint: int, theta: Theta, c: Array) -> str:
+        if len(theta) == 1:
+            return f"{self.signature} (order {theta['order']:g} of the motor)"
+        return f"{self.signature} ({len(theta)} harmonics of the motor's angle, {min(theta.values()):g} to {max(theta.values()):g})"
 
 
 class Eccentricity(Ripple):
@@ -163,6 +183,14 @@ class Eccentricity(Ripple):
                 scene, joint, self.effect, "phase_rad", float(np.arctan2(c[1], c[0])), spread / max(amplitude, 1e-15)
             ),
         ]
+
+
+def harmonics(motor_angle: Array, theta: Theta) -> Array:
+    """Sine and cosine of each order, shape (T, 2 orders)."""
+    angles = motor_angle[:, None] * np.array(list(theta.values()))
+    out = np.empty((len(angles), 2 * angles.shape[1]))
+    out[:, ::2], out[:, 1::2] = np.sin(angles), np.cos(angles)
+    return out
 
 
 def _rate(total: Array, view: View) -> Array:

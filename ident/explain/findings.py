@@ -32,6 +32,7 @@ def findings(competition: Competition, outcome: Outcome) -> list[Finding]:
     for i, (accepted, scan) in enumerate(zip(outcome.accepted, outcome.scans, strict=True)):
         others = outcome.accepted[:i] + outcome.accepted[i + 1 :]
         stage = competition.stage(others)
+        scan = [r for r in scan if _rivals(r, accepted)]
         c, std = coefficients[i]
         out.append(_finding(scene, stage, accepted, scan, c, std, ratio, outcome))
     return sorted(out, key=lambda f: -max(f.cost_Nm, default=0.0))
@@ -101,6 +102,12 @@ def _finding(
         cost_Nm=_cost(scene, found, c),
         curve=_curve(scene, found, c),
     )
+
+
+def _rivals(one: Ranked, other: Ranked) -> bool:
+    """They could explain the same excess: a joint in common, or one of them is the whole arm's."""
+    a, b = set(one.candidate.joints), set(other.candidate.joints)
+    return not a or not b or bool(a & b)
 
 
 def _with_forms(scene: Scene, stage: Stage, found: Ranked, own: list[Parameter]) -> list[Parameter]:

@@ -86,29 +86,36 @@ class AsymmetricViscous(Asymmetric):
 
 
 class ViscousNonlinear(Hypothesis):
-    """Friction that grows with a power of speed, c |v / v_max|^p sign v; p = 0 is asinh (Eyring)."""
+    """Friction that does not grow in proportion to speed: c |v / v_max|^p sign v, or thinning lubricant,
+    c asinh(v / v_0) / asinh(v_max / v_0) (Eyring 1936), which has no jump at standstill."""
 
     effect = "friction.viscous_nonlinear"
     group = "speed friction"
-    signature = "a torque that is a curved, odd function of speed and largest at high speed"
+    signature = "a torque that is a curved, odd function of speed"
     experiments = ("plateaus",)
     curve = "speed"
 
     def grid(self, scene: Scene, joint: int) -> Sequence[Theta]:
-        return [{"exponent": p} for p in (0.0, 0.5, 1.5, 2.0, 3.0)]
+        powers = [{"exponent": p, "knee": 0.0} for p in (0.5, 1.5, 2.0, 3.0)]
+        return [*powers, *({"exponent": 0.0, "knee": k} for k in (0.02, 0.05, 0.12, 0.3))]
 
     def columns(self, scene: Scene, view: View, joint: int, theta: Theta) -> Array:
         x = view.motion.qd[:, joint] / scene.peak[joint]
-        if theta["exponent"] == 0:
-            return np.asarray(np.arcsinh(x / 0.1)[:, None] / np.arcsinh(10.0))
+        if theta["knee"]:
+            return np.asarray(np.arcsinh(x / theta["knee"])[:, None] / np.arcsinh(1 / theta["knee"]))
         return np.asarray((np.abs(x) ** theta["exponent"] * scene.sign(view, joint))[:, None])
 
     def near(self, scene: Scene, joint: int, theta: Theta, step: float) -> list[Theta]:
+        if theta["knee"]:
+            return scaled(theta, "knee", (1 / (1 + 0.5 * step), 1 + 0.5 * step))
         p = theta["exponent"]
-        return [{"exponent": max(0.3, p + d * step)} for d in (-0.25, 0.25) if abs(p + d * step - 1) > 0.15] if p else []
+        return [{**theta, "exponent": max(0.3, p + d * step)} for d in (-0.25, 0.25) if abs(p + d * step - 1) > 0.15]
 
     def parameters(self, scene: Scene, joint: int, theta: Theta, c: Array, std: Array) -> list[Parameter]:
-        p = theta["exponent"] or 0.5
+        p = theta["exponent"]
+        if theta["knee"]:  # its logarithmic slope at half of the largest speed
+            x = 0.5 / theta["knee"]
+            p = float(x / (np.sqrt(1 + x**2) * np.arcsinh(x)))
         return [
             parameter(scene, joint, self.effect, "torque_Nm", c[0], std[0]),
             parameter(scene, joint, self.effect, "velocity_rad_s", scene.peak[joint], 0.0),

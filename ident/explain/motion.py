@@ -18,6 +18,7 @@ FILTER_HZ = 100.0  # of positions; four times the band that is judged, so that i
 FILTER_SHARE = 0.4  # of the sampling rate, at most
 INNER_HZ = 500.0  # columns are evaluated at this rate: a reversal takes some ms
 SHORTEST_S = 1.5  # of a motion
+JUMP, JUMP_SHARE, JUMP_PAD_S = 3.0, 0.1, 0.3  # times faster than the rest, in the first tenth; settling after it
 CLIPPED = 8  # samples in a row at the extreme value of a torque that no live signal repeats
 
 
@@ -126,7 +127,7 @@ def motions(
         rate = 1 / float(np.median(np.diff(run.signals.t_s))) if run.signals.t_s.size > 2 else 1000.0
         dataset = prepare(run.signals, min(filter_Hz, FILTER_SHARE * rate))
         for segment in dataset.segments:
-            out += _of_segment(run, index, segment, dataset.period_s, fold=fold)
+            out += _of_segment(run, index, _after_jump(segment), dataset.period_s, fold=fold)
     if not out:
         raise DataError(
             f"{runs[0].signals.source}: no stretch is {SHORTEST_S:g} s long. Record at least some seconds of motion."
@@ -164,6 +165,19 @@ def _of_segment(run: Run, index: int, segment: Segment, period_s: float, *, fold
     if T - found.end > found.period // 2 and _moves(segment, slice(found.end, T)):
         out += _of_segment(run, index, _cut(segment, slice(found.end, T)), period_s, fold=fold)
     return out
+
+
+def _after_jump(segment: Segment) -> Segment:
+    """Without a start-up jump: a drive that homes, many times faster than anything after it."""
+    T = segment.t_s.size
+    head = int(JUMP_SHARE * T)
+    speed = np.abs(segment.qd)
+    rest = speed[head:].max(axis=0)
+    jumps = np.flatnonzero((speed[:head] > JUMP * np.maximum(rest, 1e-9)).any(axis=1) & (rest > 0).any())
+    if not jumps.size:
+        return segment
+    step = segment.t_s[1] - segment.t_s[0]
+    return _cut(segment, slice(min(T, int(jumps[-1]) + round(JUMP_PAD_S / step)), T))
 
 
 def _moves(segment: Segment, rows: slice) -> bool:

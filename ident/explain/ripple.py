@@ -9,7 +9,7 @@ from scipy import linalg, signal
 
 from ident.explain import candidates
 from ident.explain.candidates import Batch
-from ident.explain.drives import Eccentricity, Ripple
+from ident.explain.drives import Eccentricity, Ripple, harmonics
 from ident.explain.hypothesis import gear
 from ident.explain.scene import Scene
 
@@ -19,7 +19,9 @@ AR_ORDER = 12  # of the model that whitens the residual
 FINE = 0.25  # step of orders times the range travelled [rad of harmonic phase over the range, over 2 pi / 4]
 MOST_ORDERS = 3000
 PEAKS = 8  # orders per joint that enter the competition
-STRIDE_HZ = 500.0
+TURNS = 12  # of scan and fit
+CLEAR_NATS = 12.0  # of one order, out of some thousands
+MOST_HARMONICS = 100
 
 
 @dataclass(frozen=True)
@@ -43,21 +45,42 @@ class Order:
 
 
 def orders(scene: Scene, joint: int) -> list[Order]:
-    """Strongest harmonics of one joint, best first; those with a positive held-out gain."""
+    """Harmonics of one joint with a clear held-out gain, strongest first; found in turns, each on what is left."""
     q = [v.motion.q[:, joint] for v in scene.views]
     span = float(np.ptp(np.concatenate(q)))
-    if span <= 1e-9 or not any(w for w in scene.weight[joint]):
+    if span <= 1e-9 or not scene.weight[joint].any():
         return []
-    residual = [_highpassed(v.residual[:, joint]) for v in scene.views]
+    found: list[Order] = []
+    residual = [v.residual[:, joint] - v.residual[:, joint].mean() for v in scene.views]
+    original = np.concatenate(residual)
+    turns = gear(scene, joint)
+    for _ in range(TURNS):
+        fresh = [o for o in _scan(scene, joint, residual, span) if all(abs(o.order - f.order) > 1e-9 for f in found)]
+        fresh = [o for o in fresh if o.gain > (CLEAR_NATS if found else 3.0)]
+        if not fresh:
+            break
+        found += fresh
+        theta = {f"order{k}": o.order for k, o in enumerate(found)}
+        X = [harmonics(x * turns, theta) for x in q]
+        c, *_ = np.linalg.lstsq(np.concatenate(X), original, rcond=None)
+        before = sum(float(r @ r) for r in residual)
+        residual = np.split(original - np.concatenate(X) @ c, np.cumsum([len(x) for x in q])[:-1])
+        if fresh[0].gain < CLEAR_NATS or sum(float(r @ r) for r in residual) > 0.98 * before:
+            break
+    return found
+
+
+def _scan(scene: Scene, joint: int, residual: list[Array], span: float) -> list[Order]:
+    """Strongest harmonics of what is left."""
     taps = _whitening(residual)
     white = [signal.lfilter(taps, [1.0], r) for r in residual]
+    innovation = float(np.median([np.var(w[AR_ORDER:]) for w in white]))
     white = [signal.lfilter(taps, [1.0], w[::-1])[::-1] for w in white]
-    innovation = float(np.median([np.var(signal.lfilter(taps, [1.0], r)[AR_ORDER:]) for r in residual]))
     response = np.abs(np.fft.rfft(taps, 512)) ** 2
     n_step = 2 * np.pi * FINE / span
     rate = 1 / scene.views[0].motion.dt_s
-    fastest = max(float(np.quantile(np.abs(v.motion.qd[:, joint]), 0.3)) for v in scene.views)
-    n_max = min(2 * np.pi * 0.3 * rate / max(fastest, 1e-9), n_step * MOST_ORDERS)
+    ordinary = max(float(np.quantile(np.abs(v.motion.qd[:, joint]), 0.3)) for v in scene.views)
+    n_max = min(2 * np.pi * 0.3 * rate / max(ordinary, 1e-9), n_step * MOST_ORDERS)
     per_rad = np.arange(4 * n_step, n_max, n_step)
     if not per_rad.size or innovation <= 0:
         return []
@@ -70,14 +93,20 @@ def orders(scene: Scene, joint: int) -> list[Order]:
         piece = np.searchsorted(pieces, fold[k][row])
         live = (scene.weight[joint][scene.row_motion[joint] == k] > 0)[row].astype(float)
         speed = np.abs(view.motion.qd[:, joint]) * view.motion.dt_s / np.pi  # of Nyquist, per unit of per_rad
-        _project(q[k], white[k], speed, live, piece, per_rad[0], n_step, response, S, V)
+        q = view.motion.q[:, joint]
+        _project(q, white[k], speed, live, piece, per_rad[0], n_step, response, S, V)
     return _peaks(scene, joint, per_rad, S, V, innovation)
 
 
 def batches(scene: Scene, joint: int, found: list[Order]) -> list[Batch]:
-    """Ripple and eccentricity of these orders as candidates."""
-    thetas = [{"order": o.order} for o in found]
-    made = [candidates.batch(scene, h, joint, thetas) for h in (Ripple(), Eccentricity())]
+    """Single orders of ripple and eccentricity, and the series of all clear ones, as candidates."""
+    single = [{"order": o.order} for o in found[:PEAKS]]
+    made = [candidates.batch(scene, h, joint, single) for h in (Ripple(), Eccentricity())]
+    clear = [o.order for o in found if o.gain > CLEAR_NATS][:MOST_HARMONICS]
+    for count in sorted({len(clear), max(2, len(clear) // 3)}):
+        if len(clear) > 1:
+            series = {"order" if k == 0 else f"order{k + 1}": order for k, order in enumerate(clear[:count])}
+            made.append(candidates.batch(scene, Ripple(), joint, [series]))
     return [b for b in made if b is not None]
 
 
@@ -105,10 +134,6 @@ def _peaks(scene: Scene, joint: int, per_rad: Array, S: NDArray[np.complex128], 
         std = float(np.sqrt(noise / total_V[i]))
         out.append(Order(float(order), float(per_rad[i]), float(gain[i]), (c[i].imag, c[i].real), std, inside))
     return out
-
-
-def _highpassed(r: Array) -> Array:
-    return np.asarray(r - r.mean())
 
 
 def _whitening(residual: list[Array]) -> Array:

@@ -110,7 +110,7 @@ class BaseFlexibility(Hypothesis):
         slides = scene.joints == 1
         wrench, carried = _base_torque(scene.model.geometry, view, links, axis, slides=slides)
         angle, acceleration = _oscillation(wrench, view, theta["frequency_Hz"])
-        load = (carried * acceleration).T
+        load = (carried * acceleration[:, None]).T
         if not slides:
             load = load + _tilted(scene, view, links, axis) * angle
         return load[:, :, None]
