@@ -50,31 +50,50 @@ def orders(scene: Scene, joint: int) -> list[Order]:
     span = float(np.ptp(np.concatenate(q)))
     if span <= 1e-9 or not scene.weight[joint].any():
         return []
-    found: list[Order] = []
-    residual = [v.residual[:, joint] - v.residual[:, joint].mean() for v in scene.views]
-    original = np.concatenate(residual)
+    original = [v.residual[:, joint] - v.residual[:, joint].mean() for v in scene.views]
+    # first as it is: where ripple is most of the residual, whitening would take it for the noise
+    found = _in_turns(scene, joint, original, span, [], whiten=False)
+    return _in_turns(scene, joint, original, span, found, whiten=True)
+
+
+def _in_turns(
+    scene: Scene, joint: int, original: list[Array], span: float, found: list[Order], *, whiten: bool
+) -> list[Order]:
+    """Orders with those found before, each round on what the ones before leave."""
+    found = list(found)
     turns = gear(scene, joint)
+    angle = np.concatenate([v.motion.q[:, joint] for v in scene.views]) * turns
+    whole = np.concatenate(original)
+    cuts = np.cumsum([len(r) for r in original])[:-1]
+    residual = _left(whole, angle, found, cuts)
     for _ in range(TURNS):
-        fresh = [o for o in _scan(scene, joint, residual, span) if all(abs(o.order - f.order) > 1e-9 for f in found)]
-        fresh = [o for o in fresh if o.gain > (CLEAR_NATS if found else 3.0)]
-        if not fresh:
+        fresh = [o for o in _scan(scene, joint, residual, span, whiten=whiten) if o.gain > CLEAR_NATS]
+        fresh = [o for o in fresh if all(abs(o.order - f.order) > 1e-9 for f in found)]
+        if not fresh or len(found) > MOST_HARMONICS:
             break
         found += fresh
-        theta = {f"order{k}": o.order for k, o in enumerate(found)}
-        X = [harmonics(x * turns, theta) for x in q]
-        c, *_ = np.linalg.lstsq(np.concatenate(X), original, rcond=None)
         before = sum(float(r @ r) for r in residual)
-        residual = np.split(original - np.concatenate(X) @ c, np.cumsum([len(x) for x in q])[:-1])
-        if fresh[0].gain < CLEAR_NATS or sum(float(r @ r) for r in residual) > 0.98 * before:
+        residual = _left(whole, angle, found, cuts)
+        if sum(float(r @ r) for r in residual) > 0.995 * before:
             break
     return found
 
 
-def _scan(scene: Scene, joint: int, residual: list[Array], span: float) -> list[Order]:
+def _left(whole: Array, angle: Array, found: list[Order], cuts: NDArray[np.int64]) -> list[Array]:
+    """The residual less its fit by the orders found, by motion."""
+    if not found:
+        return np.split(whole, cuts)
+    X = harmonics(angle, {f"order{k}": o.order for k, o in enumerate(found)})
+    A = X.T @ X
+    c = np.linalg.solve(A + 1e-6 * np.trace(A) / len(A) * np.eye(len(A)), X.T @ whole)
+    return np.split(whole - X @ c, cuts)
+
+
+def _scan(scene: Scene, joint: int, residual: list[Array], span: float, *, whiten: bool) -> list[Order]:
     """Strongest harmonics of what is left."""
-    taps = _whitening(residual)
+    taps = _whitening(residual) if whiten else np.array([1.0])
     white = [signal.lfilter(taps, [1.0], r) for r in residual]
-    innovation = float(np.median([np.var(w[AR_ORDER:]) for w in white]))
+    innovation = float(np.mean([np.var(w[AR_ORDER:]) for w in white]))
     white = [signal.lfilter(taps, [1.0], w[::-1])[::-1] for w in white]
     response = np.abs(np.fft.rfft(taps, 512)) ** 2
     n_step = 2 * np.pi * FINE / span
