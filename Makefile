@@ -3,13 +3,14 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help demo test lint bench fuzz soak lock clean
+.PHONY: help demo test lint bench janot fuzz soak lock clean
 
 help:
 	@echo "make demo    emulate, drive, record and identify a six-axis arm; the report is out/demo/report.html"
 	@echo "make test    the whole test suite"
 	@echo "make lint    style, types and import contracts"
 	@echo "make bench   timings, as ratios against peers"
+	@echo "make janot   the tables of Janot et al. 2014 on the emulated TX40, beside the paper's"
 	@echo "make fuzz    10 million random and mutated frames into drive, host and decoder"
 	@echo "make soak    a minute in real time: lost frames, late cycles, cost of the recorder"
 	@echo "make lock    resolve requirements.lock anew (needs uv)"
@@ -28,6 +29,9 @@ lint: $(READY)
 
 bench: $(READY)
 	$(BIN)/armrig bench
+
+janot: $(READY)
+	$(BIN)/python tests/studies/janot2014.py
 
 fuzz: $(READY)
 	$(BIN)/python tests/studies/fuzz.py

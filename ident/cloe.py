@@ -31,7 +31,8 @@ Array = NDArray[np.float64]
 
 ROWS_HZ = 100.0  # positions are averaged to this rate: ten times the bandwidth of the motion
 SETTLED_S = 0.5  # after the start; when each drive was switched on, and the arm sank into its law, is not known exactly
-CLOSE, NEAR = 0.1, 1.0  # radii of the confidence region
+CLOSE = 0.1  # radii of the confidence region, errors of positions being taken as uncorrelated
+NEAR = 3.0  # the same; they are correlated over the settling time of the loop, so the true region is larger than this
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class _Point:
 class Cloe:
     """CLOE.
 
-    It has converged within a tenth of a radius of the confidence region from the best parameters, or within one where
+    It has converged within a tenth of a radius of the confidence region from the best parameters, or within three where
     the output error does not fall any more: dry friction makes its last digits uneven.
 
     Attributes:
