@@ -17,7 +17,7 @@ class LssServer:
 
     Attributes:
         node_id: Pending; taken over when communication is reset.
-        stored_node_id: After power on.
+        stored_node_id, stored_bit_rate: After power on.
         bit_rate: The device's own [bit/s]; it hears nothing on a bus with another.
         quiet: Between the two delays of a change of bit rate: neither sends nor hears.
     """
@@ -39,7 +39,7 @@ class LssServer:
         """
         self._identity = identity
         self.node_id = self.stored_node_id = node_id
-        self.bit_rate = self._pending_rate = bit_rate
+        self.bit_rate = self._pending_rate = self.stored_bit_rate = bit_rate
         self.quiet = False
         self._timers = timers
         self._send = send
@@ -52,6 +52,10 @@ class LssServer:
 
     def power_on(self) -> None:
         self.node_id = self.stored_node_id
+        self.bit_rate = self._pending_rate = self.stored_bit_rate
+        self.quiet = False
+        self._timers.cancel("bit rate")
+        self._timers.cancel("bit rate used")
         self._mode = Mode.WAITING
         self._selected = self._scanned = 0
 
@@ -139,7 +143,7 @@ class LssServer:
         elif what == Service.ACTIVATE_BIT_TIMING:
             self._activate((a | b << 8) * _MS)
         elif what == Service.STORE:
-            self.stored_node_id = self.node_id
+            self.stored_node_id, self.stored_bit_rate = self.node_id, self._pending_rate
             self._answer(Service.STORE, 0)
         elif Service.INQUIRE_VENDOR <= what <= Service.INQUIRE_SERIAL:
             value = self._identity[what - Service.INQUIRE_VENDOR]

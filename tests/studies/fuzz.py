@@ -131,8 +131,8 @@ class FuzzedDrive:
         for entry in drive.device.store.dictionary.entries.values():
             entry.encode(drive.device.store.values[entry.key])  # every value fits its type
         drive.device.store.saved.clear()
-        drive.device._lss.bit_rate = 1_000_000  # somebody brings it back with a service tool
-        drive.device._lss.stored_node_id = NODE
+        lss_server = drive.device._lss  # somebody brings it back with a service tool
+        lss_server.stored_node_id, lss_server.stored_bit_rate = NODE, 1_000_000
         drive.start(self._t_ns)
 
     def feed_sound(self) -> None:
@@ -209,8 +209,11 @@ def fuzz(frames: int, seed: int, say: Callable[[str], None] = print) -> None:
     begin, early_kB = time.monotonic(), 0
     for done in range(0, frames, CHUNK):
         batch = [next(source) for _ in range(min(CHUNK, frames - done))]
+        sent = drive.sent
         for victim in (drive, host, decoder):
             victim.feed(batch)
+        if not drive.sent > sent:
+            raise SystemExit(f"the drive has sent nothing in {CHUNK} frames: it was not on the bus")
         if not early_kB and 4 * done >= frames:
             early_kB = resident_kB()
     growth_kB = resident_kB() - early_kB

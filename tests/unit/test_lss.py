@@ -142,6 +142,15 @@ def test_a_drive_at_another_bit_rate_is_not_there(selected) -> None:
     assert selected.sync(3) == [] == ask(selected, *lss.select(IDENTITY))
 
 
+def test_power_off_ends_a_change_of_bit_rate(selected) -> None:
+    ask(selected, lss.message(Service.BIT_TIMING, 0, 3), lss.message(Service.ACTIVATE_BIT_TIMING, 100))
+    assert selected.drive.start(selected.t_ns) == [Frame(0x705, b"\0")]
+    selected.wait(500)
+    assert ask(selected, *lss.select(IDENTITY)) == [reply(Service.SWITCHED)]
+    ask(selected, lss.message(Service.BIT_TIMING, 0, 3), lss.message(Service.STORE))
+    assert selected.drive.start(selected.t_ns) == []  # at 250 kbit/s on a bus of 1 Mbit/s
+
+
 def test_activating_the_same_bit_rate_takes_two_delays(selected) -> None:
     ask(selected, lss.message(Service.ACTIVATE_BIT_TIMING, 10))
     selected.wait(19)
