@@ -6,7 +6,7 @@ import pytest
 
 from emulator.axis import Measurement
 from emulator.drive import Drive
-from protocols import cia402, nmt, sdo, sdoblock
+from protocols import cia402, nmt, pdo, sdo, sdoblock
 from protocols.frames import Frame
 from protocols.robot import Drive as Config
 
@@ -89,6 +89,13 @@ class Bench:
             answers = [f for r in requests for f in self.send(nmt.sdo_request_id(self.node), r)]
             requests = [r for f in answers if f.can_id == 0x580 + self.node for r in transfer.receive(f.data)]
         assert transfer.done
+
+    def remap(self, number: int, layout: list[str], kind: int, base: int = pdo.TRANSMIT, **options: int) -> None:
+        """Give a PDO a new content by the standard procedure."""
+        name = nmt.tpdo_id if base == pdo.TRANSMIT else nmt.rpdo_id
+        mapped = [pdo.Mapped.parse(t) for t in layout]
+        for write in pdo.configuration(base, number, name(number, self.node), mapped, kind, **options):
+            self.write_bytes(*write)
 
     def refused(self, index: int, sub: int, value: int, size: int) -> sdo.Abort:
         """Abort code that a download ends with."""
