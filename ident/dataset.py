@@ -3,8 +3,7 @@
 Janot, Vandanjon & Gautier 2014, II.C. Nothing is interpolated over a gap: a gap starts a new segment.
 """
 
-import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,6 +20,8 @@ GAP = 1.5  # steps of this many periods or more are gaps
 JITTER = 0.02  # share of a period by which a step may differ; SYNC grid time has none
 NYQUIST_SHARE = 0.9  # a cut-off above this share of half the rate filters nothing
 SETTLE = 5.0  # periods of the cut-off after which the ends of the filter disturb accelerations by less than 1e-4
+FORGET = 15.5  # periods of the cut-off in which the filter forgets by 1e-16: 37 / (2 pi cos(3 pi / 8))
+PIECE = 65536  # rows filtered at a time: 6 axes are 25 MB, and the margins cost 5 % at 5 kHz and 50 Hz
 STENCIL = 2  # samples either side of the five-point differences
 
 
@@ -137,6 +138,37 @@ def prepare(signals: Signals, filter_Hz: float = FILTER_HZ) -> Dataset:
         DataError: NaN, times that do not increase, or no stretch long enough.
         ConfigError: The cut-off does not fit the sampling rate.
     """
+    plan = plan_stretches(signals, filter_Hz)
+    segments = [_segment(signals, stretch, plan, filter_Hz) for stretch in plan.stretches]
+    return Dataset(signals.source, signals.joints, plan.period_s, filter_Hz, segments, plan.notes)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Which rows of the signals become segments.
+
+    Attributes:
+        period_s: Sampling period.
+        settle: Rows at both ends that the filter disturbs.
+        delay: Of the torque, in rows, shape (J,).
+        stretches: Gapless rows, long enough.
+        notes: What was left out and why.
+    """
+
+    period_s: float
+    settle: int
+    delay: Array
+    stretches: list[slice]
+    notes: list[str]
+
+    def inner(self, stretch: slice) -> slice:
+        """Rows of a stretch, counted from its start, that are of use: both ends settled, torque known."""
+        known = stretch.stop - stretch.start - int(np.ceil(self.delay.max(initial=0.0)))
+        return slice(self.settle + STENCIL, known - self.settle - STENCIL)
+
+
+def plan_stretches(signals: Signals, filter_Hz: float) -> Plan:
+    """Gapless stretches of measured signals; raises as `prepare`."""
     _check_values(signals)
     steps = np.diff(signals.t_s)
     period = float(np.median(steps))
@@ -148,26 +180,48 @@ def prepare(signals: Signals, filter_Hz: float = FILTER_HZ) -> Dataset:
         )
     settle = int(np.ceil(SETTLE / (filter_Hz * period))) if np.isfinite(filter_Hz) else 0
     shortest = 4 * (settle + STENCIL) + int(np.ceil(signals.delay_s.max(initial=0.0) / period)) + 1
-    bounds = [0, *(np.flatnonzero(steps > GAP * period) + 1), signals.t_s.size]
-    segments, dropped = [], []
-    for start, end in itertools.pairwise(bounds):
-        if end - start < shortest:
-            dropped.append(end - start)
-        else:
-            segments.append(_segment(signals, slice(start, end), period, filter_Hz, settle))
-    if not segments:
+    gaps = np.flatnonzero(steps > GAP * period)
+    lengths = np.diff([0, *(gaps + 1), signals.t_s.size])
+    every = [slice(int(end - n), int(end)) for n, end in zip(lengths, np.cumsum(lengths), strict=True)]
+    kept = [s for s in every if s.stop - s.start >= shortest]
+    if not kept:
         raise DataError(
-            f"{signals.source}: {signals.t_s.size} samples in {len(dropped)} gapless stretches, none with the"
+            f"{signals.source}: {signals.t_s.size} samples in {len(every)} gapless stretches, none with the"
             f" {shortest} samples ({shortest * period:.2f} s) that the {filter_Hz:g} Hz filter needs. Record longer."
         )
     notes = list(signals.notes)
-    if len(bounds) > 2:
-        notes.append(f"{signals.source}: {len(bounds) - 2} gaps; the stretches between them are used one by one.")
-    if dropped:
+    if gaps.size:
+        longest = gaps[np.argmax(steps[gaps])]
         notes.append(
-            f"{signals.source}: {len(dropped)} stretches between gaps, {sum(dropped)} samples, are too short to use."
+            f"{signals.source}: {gaps.size} gaps, {float(steps[gaps].sum()):.3f} s in all, the longest"
+            f" {steps[longest]:.3f} s after {signals.t_s[longest]:.3f} s; the stretches between them are used one by"
+            " one."
         )
-    return Dataset(signals.source, signals.joints, period, filter_Hz, segments, notes)
+    if len(kept) < len(every):
+        lost = sum(s.stop - s.start for s in every) - sum(s.stop - s.start for s in kept)
+        notes.append(
+            f"{signals.source}: {len(every) - len(kept)} stretches between gaps, {lost} samples, are too short to use."
+        )
+    return Plan(period, settle, signals.delay_s / period, kept, notes)
+
+
+def pieces(signals: Signals, plan: Plan, filter_Hz: float, rows: int = PIECE) -> Iterator[Segment]:
+    """The segments of `prepare` in pieces, so that a recording of any length needs the memory of one piece.
+
+    Every piece is filtered with so many rows around it that it equals the whole to 1e-12 of the range of motion.
+    """
+    margin = STENCIL + (int(np.ceil(FORGET / (filter_Hz * plan.period_s))) if np.isfinite(filter_Hz) else 0)
+    late = int(np.ceil(plan.delay.max(initial=0.0)))
+    for stretch in plan.stretches:
+        inner = plan.inner(stretch)
+        for low in range(stretch.start + inner.start, stretch.start + inner.stop, rows):
+            high = min(low + rows, stretch.start + inner.stop)
+            around = slice(max(stretch.start, low - margin), min(stretch.stop, high + margin))
+            q = lowpass(signals.q[around], plan.period_s, filter_Hz)
+            qd, qdd = differences(q, plan.period_s)
+            here = slice(low - around.start, high - around.start)
+            tau = _aligned(signals.tau_Nm[low : high + late], plan.delay)
+            yield Segment(signals.t_s[low:high], q[here], qd[here], qdd[here], tau)
 
 
 def _check_values(signals: Signals) -> None:
@@ -200,12 +254,12 @@ def _check_times(signals: Signals, steps: Array, period: float) -> None:
         )
 
 
-def _segment(signals: Signals, rows: slice, period: float, filter_Hz: float, settle: int) -> Segment:
-    q = lowpass(signals.q[rows], period, filter_Hz)
-    tau = _aligned(signals.tau_Nm[rows], signals.delay_s / period)
-    qd, qdd = differences(q, period)
-    inner = slice(settle + STENCIL, len(tau) - settle - STENCIL)
-    return Segment(signals.t_s[rows][inner], q[inner], qd[inner], qdd[inner], tau[inner])
+def _segment(signals: Signals, stretch: slice, plan: Plan, filter_Hz: float) -> Segment:
+    q = lowpass(signals.q[stretch], plan.period_s, filter_Hz)
+    tau = _aligned(signals.tau_Nm[stretch], plan.delay)
+    qd, qdd = differences(q, plan.period_s)
+    inner = plan.inner(stretch)
+    return Segment(signals.t_s[stretch][inner], q[inner], qd[inner], qdd[inner], tau[inner])
 
 
 def lowpass(q: Array, period: float, filter_Hz: float) -> Array:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from ident.base import Base
 from ident.contract import Iterate, Statistic
@@ -133,10 +134,11 @@ def estimate(
 
 def joint_triangles(observations: Sequence[Observation]) -> list[Array]:
     """R of QR([W_j y_j]) of every joint over all recordings, J of shape (b+1, b+1)."""
-    return [
-        triangle([np.column_stack([o.W[j, o.used[j]], o.y[j, o.used[j]]]) for o in observations])
-        for j in range(len(observations[0].joints))
-    ]
+    with threadpool_limits(limits=1, user_api="blas"):  # two threads on columns as few as these are ten times slower
+        return [
+            triangle([np.column_stack([o.W[j, o.used[j]], o.y[j, o.used[j]]]) for o in observations])
+            for j in range(len(observations[0].joints))
+        ]
 
 
 def joint_rows(observations: Sequence[Observation]) -> NDArray[np.int64]:
@@ -196,7 +198,7 @@ def assemble(
         triangles: `joint_triangles(observations)`, where the method has them already.
     """
     b, joints = len(base.names), len(observations[0].joints)
-    scaled, condition = _conditions(triangle(triangles or joint_triangles(observations))[:, :b])
+    scaled, condition = conditions(triangle(triangles or joint_triangles(observations))[:, :b])
     residuals = [o.y - o.predict(beta) for o in observations]
     lag1 = np.array([_lag1(observations, residuals, j) for j in range(joints)])
     error, per_joint = relative_error(observations, beta)
@@ -250,7 +252,7 @@ def _residual_norm(factor: Array, b: int) -> float:
     return float(abs(factor[b, b]))
 
 
-def _conditions(A: Array) -> tuple[float, float]:
+def conditions(A: Array) -> tuple[float, float]:
     """Condition of the column-scaled and of the raw matrix; infinite for a column of zeros."""
     norms = np.linalg.norm(A, axis=0)
     if not norms.all():
@@ -267,6 +269,11 @@ def refuse_deficient(A: Array, base: Base, observations: Sequence[Observation]) 
     Raises:
         IdentificationError: There are such parameters; names them.
     """
+    refuse_hidden(A, base, " ".join(n for o in observations for n in o.notes if "moved by only" in n))
+
+
+def refuse_hidden(A: Array, base: Base, still: str) -> None:
+    """As `refuse_deficient`; `still` says which joints were at rest."""
     norms = np.linalg.norm(A, axis=0)
     unseen = norms <= DEFICIENT * norms.max(initial=0.0)
     _, values, rows = np.linalg.svd(A / np.where(unseen, 1.0, norms))
@@ -274,7 +281,6 @@ def refuse_deficient(A: Array, base: Base, observations: Sequence[Observation]) 
     lost = unseen | (np.abs(rows[hidden]) > SHOWN_SHARE).any(axis=0)
     if lost.any():
         names = ", ".join(name for name, out in zip(base.names, lost, strict=True) if out)
-        still = " ".join(n for o in observations for n in o.notes if "moved by only" in n)
         raise IdentificationError(
             f"This motion does not show {int(hidden.sum())} of {len(base.names)} combinations of parameters; involved:"
             f" {names}. {still + ' ' if still else ''}Record a motion in which every joint moves, fast and slow, in"

@@ -13,11 +13,12 @@ from protocols.robot import Geometry
 Array = NDArray[np.float64]
 
 
-def inertial_regressor(geometry: Geometry, q: Array, qd: Array, qdd: Array) -> Array:
+def inertial_regressor(geometry: Geometry, q: Array, qd: Array, qdd: Array, out: Array | None = None) -> Array:
     """Columns of the 10 J inertial parameters, rigid bodies under gravity.
 
     Args:
         q, qd, qdd: shape (T, J) [rad, rad/s, rad/s²].
+        out: Where to write, shape (J, T, 10 J) or more columns, zero where this function leaves zeros.
 
     Returns:
         shape (J, T, 10 J): joint first (the rows of one joint are the sub-system of Janot et al. 2014, eq. (5)), then
@@ -25,7 +26,7 @@ def inertial_regressor(geometry: Geometry, q: Array, qd: Array, qdd: Array) -> A
         before i are zero.
     """
     samples, joints = q.shape
-    out = np.zeros((joints, samples, 10 * joints))
+    out = np.zeros((joints, samples, 10 * joints)) if out is None else out
     _fill(
         geometry.R0,
         geometry.p0,

@@ -90,19 +90,20 @@ class Model:
             axis += [_LINEAR_UNITS[unit] if self.geometry.prismatic[j] else unit for j in where]
         return inertial + axis
 
-    def regressor(self, q: Array, qd: Array, qdd: Array) -> Array:
+    def regressor(self, q: Array, qd: Array, qdd: Array, out: Array | None = None) -> Array:
         """All columns.
 
         Args:
             q, qd, qdd: shape (T, J).
+            out: Result of an earlier call for as many samples, to be overwritten: zeros cost as much as the columns.
 
         Returns:
             shape (J, T, P): joint, sample, parameter.
         """
         J, C = self.joints, self.coupling
         samples = q.shape[0]
-        W = np.zeros((J, samples, len(self.names)))
-        W[:, :, : 10 * J] = inertial_regressor(self.geometry, q, qd, qdd)
+        W = np.zeros((J, samples, len(self.names))) if out is None else out
+        inertial_regressor(self.geometry, q, qd, qdd, W)
         motor_speed, motor_acceleration = qd @ C.T, qdd @ C.T
         column = 10 * J
         for kind, where in self._groups:

@@ -105,12 +105,11 @@ def observe(
     if np.isfinite(decimate_to_Hz) and decimate_to_Hz > 1.0001 * rate:
         raise ConfigError(f"decimate_to_Hz = {decimate_to_Hz:g} is more than the {rate:.0f} Hz of {dataset.source}.")
     factor = max(1, round(rate / decimate_to_Hz)) if np.isfinite(decimate_to_Hz) else 1
-    slow = SLOW * dataset.peak_speed() if speed_threshold is None else np.full(model.joints, speed_threshold)
     still = dataset.span() < STILL
+    slow = SLOW * dataset.peak_speed() if speed_threshold is None else np.full(model.joints, speed_threshold)
     slow = np.where(still, np.inf, slow)
-    slow_motor = np.abs(model.coupling) @ np.where(still, 0.0, slow)
     parts = [
-        _rows(segment, model, base, factor, slow, slow_motor)
+        _rows(segment, model, base, factor, slow)
         for segment in dataset.segments
         if segment.t_s.size > (2 * EDGE + 2) * factor
     ]
@@ -145,8 +144,23 @@ def observe(
     )
 
 
+def usable(model: Model, qd: Array, slow: Array) -> NDArray[np.bool_]:
+    """Where neither a joint nor a coupled motor that drives it is slow, shape (J, T).
+
+    Args:
+        qd: shape (T, J).
+        slow: Speeds below which the sign of friction is uncertain, shape (J,); infinite for a joint at rest.
+    """
+    slow_motor = np.abs(model.coupling) @ np.where(np.isfinite(slow), slow, 0.0)
+    moving = (np.abs(qd) >= slow).T
+    turning = (np.abs(qd @ model.coupling.T) >= slow_motor).T
+    for k in model.coupled:
+        moving = moving & (turning[k] | (model.coupling[k] == 0)[:, None])
+    return moving
+
+
 def _rows(
-    segment: Segment, model: Model, base: Base, factor: int, slow: Array, slow_motor: Array
+    segment: Segment, model: Model, base: Base, factor: int, slow: Array
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     """Times, columns, torque and usable rows of one stretch, decimated."""
     samples = segment.t_s.size
@@ -163,13 +177,9 @@ def _rows(
             W[j, here] = decimate(columns[j], factor)[grid[here] - low]
             y[j, here] = decimate(segment.tau_Nm[part, j : j + 1], factor)[grid[here] - low, 0]
     # The filter spreads a change of sign over its neighbours: one decimated sample either side counts as slow too.
-    reach = np.arange(-factor, factor + 1)
+    reach = np.arange(-factor, factor + 1) if factor > 1 else np.zeros(1, dtype=int)
     near = np.clip(grid[:, None] + reach, 0, samples - 1)
-    moving = (np.abs(segment.qd) >= slow)[near].all(axis=1).T
-    turning = (np.abs(segment.qd @ model.coupling.T) >= slow_motor)[near].all(axis=1).T
-    used = moving.copy()
-    for k in model.coupled:
-        used &= turning[k] | (model.coupling[k] == 0)[:, None]
+    used = np.asarray(usable(model, segment.qd, slow)[:, near].all(axis=2))
     return segment.t_s[grid], W, y, used
 
 
