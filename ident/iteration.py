@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.simulator import Simulation
 from ident import auxiliary
 from ident.auxiliary import Run
 from ident.contract import Iterate
@@ -83,7 +84,6 @@ class Outcome:
     Attributes:
         beta: shape (b,).
         step, solution, columns: Of the last system: what it was, its solution, the simulated columns it had.
-        final: Columns simulated at beta.
         history: Every iteration, the start first.
         notes: If it was stopped, or beta itself cannot be simulated.
     """
@@ -92,7 +92,6 @@ class Outcome:
     step: Step
     solution: Solution
     columns: list[Observation]
-    final: list[Observation]
     history: list[Iterate]
     converged: bool
     notes: list[str]
@@ -142,7 +141,8 @@ def iterate(
         now = residual_norm(step.rows, solution.beta)
         converged = criterion.met(change, now, norm)
         beta, norm = solution.beta, now
-    final, simulated, error = _columns(problem, name, runs, beta, sound, update_gains, len(history))
+    simulations, simulated = _simulate(problem, name, runs, beta, sound, update_gains, len(history))
+    error = auxiliary.position_error_percent(runs, simulations)
     history.append(Iterate(beta.tolist(), error.tolist(), norm))
     notes = [] if converged else [criterion.complaint(name, base.names, change)]
     if not np.array_equal(simulated, beta):
@@ -150,7 +150,7 @@ def iterate(
             f"{name}: the estimate itself cannot be simulated (its mass matrix is not positive definite on this"
             " motion); the auxiliary model had parameters near it."
         )
-    return Outcome(beta, step, solution, columns, final, history, converged, notes)
+    return Outcome(beta, step, solution, columns, history, converged, notes)
 
 
 def residual_norm(observations: Sequence[Observation], beta: Array) -> float:
@@ -162,14 +162,18 @@ def _columns(
     problem: Problem, name: str, runs: Sequence[Run], beta: Array, sound: Array, update_gains: bool, k: int
 ) -> tuple[list[Observation], Array, Array]:
     """Columns of the arm simulated at beta or near it, the parameters it had, and its position errors."""
-    try:
-        simulated, used = auxiliary.simulate_near(
-            runs, problem.model, problem.base, beta, sound, update_gains=update_gains
-        )
-    except IdentificationError as error:
-        raise IdentificationError(f"{name}, iteration {k}: {error}") from error
+    simulated, used = _simulate(problem, name, runs, beta, sound, update_gains, k)
     columns = [
         problem.observe(prepare(auxiliary.as_signals(run, stretches), dataset.filter_Hz))
         for run, stretches, dataset in zip(runs, simulated, problem.datasets, strict=True)
     ]
     return columns, used, auxiliary.position_error_percent(runs, simulated)
+
+
+def _simulate(
+    problem: Problem, name: str, runs: Sequence[Run], beta: Array, sound: Array, update_gains: bool, k: int
+) -> tuple[list[list[Simulation]], Array]:
+    try:
+        return auxiliary.simulate_near(runs, problem.model, problem.base, beta, sound, update_gains=update_gains)
+    except IdentificationError as error:
+        raise IdentificationError(f"{name}, iteration {k}: {error}") from error

@@ -78,7 +78,7 @@ class IdimIv:
             iterations=found.iterations,
             converged=found.converged,
             history=found.history,
-            tests=[hausman(problem.observations, found.final, found.step.sigma)],
+            tests=[hausman(problem.observations, found.columns, found.step.sigma)],
         )
 
 

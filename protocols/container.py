@@ -58,10 +58,16 @@ class Span(NamedTuple):
 
 @dataclass(slots=True)
 class ChunkSpan:
-    """A chunk and, where it is indexed, the arrival of its messages by channel id [ns]."""
+    """A chunk and, where it is indexed, its messages by channel id.
+
+    Attributes:
+        log_time: Arrival [ns].
+        offset: Where their records begin in the chunk's own data, as the index claims.
+    """
 
     span: Span
     log_time: dict[int, NDArray[np.uint64]] = field(default_factory=dict)
+    offset: dict[int, NDArray[np.uint64]] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -213,6 +219,7 @@ def _note(contents: Contents, span: Span) -> None:
                 buffer, _INDEX_ENTRY, length // _INDEX_ENTRY.itemsize, span.start + _INDEX_HEAD.size
             )
             contents.chunks[-1].log_time[channel] = entries["log_time"]
+            contents.chunks[-1].offset[channel] = entries["offset"]
         case Opcode.MESSAGE if span.end - span.start >= MESSAGE.size:
             contents.loose.append(span)
         case Opcode.ATTACHMENT:

@@ -4,10 +4,32 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from protocols.container import MESSAGE, BrokenFileError, Buffer, Contents, Span, messages_in
+from protocols.container import (
+    MESSAGE,
+    BrokenFileError,
+    Buffer,
+    ChunkSpan,
+    Contents,
+    Span,
+    messages_in,
+    open_chunk,
+)
 
+# A message record: opcode and length, then the head of `MESSAGE`.
+_HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("published", "<u8"),
+    ]
+)
+_RECORD_BYTES = 9  # of opcode and length
 MAX_SIGNAL_BYTES = 4 << 30  # of the topics read at once; ten hours of six drives at 1 kHz
 
 
@@ -51,7 +73,8 @@ def messages_by_chunk(contents: Contents, topics: Collection[str]) -> Iterator[d
     for chunk in contents.chunks:
         known = [contents.channels[i].topic for i in chunk.log_time if i in contents.channels]
         if len(known) < len(chunk.log_time) or not known or not set(topics).isdisjoint(known):
-            yield _gather(contents, *messages_in(contents, chunk), topics)
+            indexed = _indexed(contents, chunk, topics)
+            yield _gather(contents, *messages_in(contents, chunk), topics) if indexed is None else indexed
     yield _gather(contents, contents.buffer, contents.loose, topics)
 
 
@@ -80,6 +103,48 @@ def _times(data: Buffer, spans: list[Span]) -> dict[int, NDArray[np.uint64]]:
     return {channel: np.array(log_time, dtype=np.uint64) for channel, log_time in times.items()}
 
 
+def _indexed(contents: Contents, chunk: ChunkSpan, topics: Collection[str]) -> dict[str, Messages] | None:
+    """Messages at the places the index names, a hundred times faster than record by record; None if it is not true.
+
+    It is true if its records are messages of its channels that fill the chunk's data without gap or overlap.
+    """
+    if not chunk.offset or not set(chunk.offset) <= set(contents.channels):
+        return None
+    data = np.frombuffer(open_chunk(contents.buffer, chunk.span)[1], dtype=np.uint8)
+    begin = np.concatenate(list(chunk.offset.values())).astype(np.int64)
+    channel = np.repeat(list(chunk.offset), [len(o) for o in chunk.offset.values()])
+    order = np.argsort(begin)
+    begin, channel = begin[order], channel[order]
+    if not begin.size or begin[0] != 0 or begin[-1] > data.size - _HEAD.itemsize:
+        return None
+    head = data[begin[:, None] + np.arange(_HEAD.itemsize)].view(_HEAD)[:, 0]
+    end = begin + _RECORD_BYTES + head["length"].astype(np.int64)
+    if (
+        (head["opcode"] != Opcode.MESSAGE).any()
+        or (head["channel"] != channel).any()
+        or (head["length"] < MESSAGE.size).any()
+        or (end[:-1] != begin[1:]).any()
+        or end[-1] != data.size
+    ):
+        return None
+    found: dict[str, Messages] = {}
+    for number, described in contents.channels.items():
+        rows = np.flatnonzero(channel == number)
+        if described.topic not in topics or not rows.size:
+            continue
+        some = found.setdefault(described.topic, Messages())
+        some.log_time += head["log_time"][rows].tolist()
+        some.blocks += _blocks(data, begin[rows] + _HEAD.itemsize, end[rows])
+    return found
+
+
+def _blocks(data: NDArray[np.uint8], begin: NDArray[np.int64], end: NDArray[np.int64]) -> list[NDArray[np.uint8]]:
+    """Bytes of messages, equal sizes together."""
+    size = end - begin
+    runs = np.split(np.arange(len(size)), np.flatnonzero(np.diff(size)) + 1)
+    return [data[begin[run][:, None] + np.arange(size[run[0]])] for run in runs]
+
+
 def _gather(contents: Contents, data: Buffer, spans: list[Span], topics: Collection[str]) -> dict[str, Messages]:
     """Sort messages to their topics, equal sizes together."""
     found: dict[str, Messages] = {}
@@ -95,7 +160,5 @@ def _gather(contents: Contents, data: Buffer, spans: list[Span], topics: Collect
     raw = np.frombuffer(data, dtype=np.uint8)
     for topic, where in places.items():
         begin, end = np.array(where).T
-        size = end - begin
-        for run in np.split(np.arange(len(size)), np.flatnonzero(np.diff(size)) + 1):
-            found[topic].blocks.append(raw[begin[run][:, None] + np.arange(size[run[0]])])
+        found[topic].blocks += _blocks(raw, begin, end)
     return found

@@ -1,7 +1,7 @@
 """Time of the methods that simulate, on 10 s of TX40 data recorded through the full chain.
 
-python tests/benchmarks/iv.py: seconds after one warm run, the reference read from the recording's frames apart. One
-BLAS thread: two on small matrices wait for each other.
+python tests/benchmarks/iv.py: processor seconds after one warm run, so that other work on the machine does not count;
+reading the reference from the recording's frames apart. One BLAS thread: two on small matrices wait for each other.
 """
 
 import os
@@ -11,7 +11,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is imported
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from time import perf_counter
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -42,12 +42,12 @@ REPEATS = 3
 
 
 def timed(call: Callable[[], Any]) -> tuple[float, Any]:
-    """Best of some runs after a warm one [s], and the result."""
+    """Processor time, best of some runs after a warm one [s], and the result."""
     result, best = call(), np.inf
     for _ in range(REPEATS):
-        start = perf_counter()
+        start = process_time()
         result = call()
-        best = min(best, perf_counter() - start)
+        best = min(best, process_time() - start)
     return best, result
 
 
