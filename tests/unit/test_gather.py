@@ -1,4 +1,4 @@
-"""Messages at the places an index names are those that a walk over every record finds; a wrong index is not believed."""
+"""Messages found by their index are those that a walk over every record finds; a wrong index is not believed."""
 
 from collections.abc import Callable
 
@@ -41,7 +41,9 @@ def test_the_index_gives_what_a_walk_gives(file: bytes) -> None:
 @pytest.mark.parametrize("damage", ["beyond", "shifted", "swapped", "short"])
 def test_an_index_that_lies_is_not_believed(file: bytes, damage: str) -> None:
     contents = scan(file)
-    for chunk in contents.chunks:
+    shared = [chunk for chunk in contents.chunks if len(chunk.offset) > 1]
+    assert shared
+    for chunk in shared:
         a, b = sorted(chunk.offset)[:2]
         if damage == "beyond":
             chunk.offset[a] = chunk.offset[a] + np.uint64(2**62)
