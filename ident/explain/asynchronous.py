@@ -185,7 +185,7 @@ def _fitted(j: int, series: Array, view: View, frequency: float, ratio: float) -
 
 def _around(high: NDArray[np.bool_], at: int, size: int) -> slice:
     """The run of flagged rows around one, gaps shorter than half a window closed."""
-    closed = ndimage.binary_closing(high, np.ones(max(2, size // 2)))
+    closed = ndimage.binary_closing(high, np.ones(max(2, size // 2), dtype=bool))
     closed[at] = True
     start = at
     while start > 0 and closed[start - 1]:

@@ -1,6 +1,7 @@
 """Hypotheses about motor, power stage and sensors."""
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 from msgspec.structs import replace
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from ident.explain.contract import Parameter
 from ident.explain.hypothesis import Flags, Hypothesis, Theta, gear, parameter, positive, within
 from ident.explain.scene import Scene, View
+from protocols.effects import Effect
 
 Array = NDArray[np.float64]
 
@@ -115,7 +117,7 @@ class Ripple(Hypothesis):
     theta holds "order", and for a series of harmonics "order2", "order3", ... besides.
     """
 
-    effect = "motor.ripple"
+    effect: ClassVar[Effect] = "motor.ripple"
     group = "ripple"
     signature = "a torque that repeats with position, of the same size at every speed"
     experiments = ("slow pass",)
@@ -152,7 +154,8 @@ class Ripple(Hypothesis):
     def because(self, scene: Scene, joint: int, theta: Theta, c: Array) -> str:
         if len(theta) == 1:
             return f"{self.signature} (order {theta['order']:g} of the motor)"
-        return f"{self.signature} ({len(theta)} harmonics of the motor's angle, {min(theta.values()):g} to {max(theta.values()):g})"
+        low, high = min(theta.values()), max(theta.values())
+        return f"{self.signature} ({len(theta)} harmonics of the motor's angle, {low:g} to {high:g})"
 
 
 class Eccentricity(Ripple):

@@ -14,16 +14,21 @@ from numpy.typing import NDArray
 from ident.base import base_parameters
 from ident.explain import (
     asynchronous,
-    findings as answers,
     judge,
     location,
     loop,
     motion,
     power,
     ripple,
-    scene as scenes,
     verdict,
 )
+from ident.explain import (
+    findings as answers,
+)
+from ident.explain import (
+    scene as scenes,
+)
+from ident.explain.candidates import Ranked
 from ident.explain.compete import Competition, Outcome, excess_ratio
 from ident.explain.contract import BeforeAfter, Explanation, Finding, Located, Pair, TrainUnseen, Unseen, finite
 from ident.explain.judge import Model3
@@ -33,7 +38,8 @@ from ident.explain.scene import Scene
 from ident.model import Model
 from ident.writeback import identified_robot
 from protocols.clock import Clock, RealClock
-from protocols.effects import EFFECTS
+from protocols.effectparams import EFFECT_KINDS
+from protocols.effects import Effect
 from protocols.errors import IdentificationError
 from protocols.robot import EffectEntry, Robot
 
@@ -157,8 +163,8 @@ def _excited(moves: Sequence[Motion], robot: Robot, notes: list[str]) -> list[in
             notes.append(f"{joint.name} hardly moved ({span[j]:.2g} in position); nothing is said about it.")
         elif turns < REVERSALS:
             notes.append(
-                f"{joint.name} reversed {turns} times; friction cannot be told from gravity and offsets. Nothing is said"
-                " about it: record a motion that goes back and forth."
+                f"{joint.name} reversed {turns} times; friction cannot be told from gravity and offsets. Nothing is"
+                " said about it: record a motion that goes back and forth."
             )
         else:
             active.append(j)
@@ -181,13 +187,13 @@ def _remarks(scene: Scene, runs: Sequence[Run], notes: list[str]) -> None:
     """What the reader should know about these recordings."""
     if not scene.floor_from_periods:
         notes.append(
-            "No motion is repeated: the noise floor comes from the spectrum above the judged band, a weaker measure, and"
-            " events are told from the rest of the motion only. Record at least three periods."
+            "No motion is repeated: the noise floor comes from the spectrum above the judged band, a weaker measure,"
+            " and events are told from the rest of the motion only. Record at least three periods."
         )
     if len(scene.views) < 3:
         notes.append(
-            f"{len(scene.views)} motion{'s' if len(scene.views) > 1 else ''}: pieces of it stand in for motion held out."
-            " Record at least three different ones."
+            f"{len(scene.views)} motion{'s' if len(scene.views) > 1 else ''}: pieces of it stand in for motion held"
+            " out. Record at least three different ones."
         )
     if scene.prior.unknown:
         notes.append(
@@ -199,7 +205,7 @@ def _remarks(scene: Scene, runs: Sequence[Run], notes: list[str]) -> None:
     notes += [note for run in runs for note in run.signals.notes if note not in notes]
 
 
-def _refreshed(scene: Scene, outcome: Outcome) -> list[answers.Ranked]:
+def _refreshed(scene: Scene, outcome: Outcome) -> list[Ranked]:
     """Accepted effects with the coefficients of the joint fit."""
     found = answers.final_coefficients(scene, outcome)
     return [replace(a, c=c, std=std) for a, (c, std) in zip(outcome.accepted, found, strict=True)]
@@ -246,13 +252,24 @@ def _written(robot: Robot, model: Model, models: Model3, found: Sequence[Finding
     """The robot file with refitted parameters and the effects found."""
     base = base_parameters(model)
     fitted = identified_robot(model, base, base.B @ models.explained)
-    entries = []
+    entries: list[EffectEntry] = []
     for finding in found:
-        if finding.effect not in EFFECTS or finding.effect == "unlisted":
-            continue
-        where = finding.joints[-1] if finding.joints else ""
-        entries.append(
-            EffectEntry(effect=finding.effect, joint=where, parameters={p.name: p.value for p in finding.parameters})
-        )
+        entries += _entries(finding)
     return msgspec.structs.replace(fitted, effect=[*robot.effect, *entries])
 
+
+def _entries(finding: Finding) -> list[EffectEntry]:
+    """Entries of a robot file for a finding: one for each harmonic of a series, what the emulator does not know left
+    out."""
+    effect = msgspec.convert(finding.effect, Effect)
+    if effect == "unlisted":
+        return []
+    where = finding.joints[-1] if finding.joints else ""
+    known = {p.name: p for p in EFFECT_KINDS[effect].parameters}
+    groups: dict[str, dict[str, float]] = {}
+    for p in finding.parameters:
+        name, _, number = p.name.partition("#")
+        if name in known:
+            low, high = known[name].low, known[name].high
+            groups.setdefault(number, {})[name] = min(max(p.value, low), high)
+    return [EffectEntry(effect=effect, joint=where, parameters=values) for values in groups.values()]

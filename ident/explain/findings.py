@@ -29,10 +29,10 @@ def findings(competition: Competition, outcome: Outcome) -> list[Finding]:
     ratio = excess_ratio(scene, outcome.stage)
     coefficients = final_coefficients(scene, outcome)
     out = []
-    for i, (accepted, scan) in enumerate(zip(outcome.accepted, outcome.scans, strict=True)):
+    for i, (accepted, every) in enumerate(zip(outcome.accepted, outcome.scans, strict=True)):
         others = outcome.accepted[:i] + outcome.accepted[i + 1 :]
         stage = competition.stage(others)
-        scan = [r for r in scan if _rivals(r, accepted)]
+        scan = [r for r in every if _rivals(r, accepted)]
         c, std = coefficients[i]
         out.append(_finding(scene, stage, accepted, scan, c, std, ratio, outcome))
     return sorted(out, key=lambda f: -max(f.cost_Nm, default=0.0))
@@ -53,7 +53,9 @@ def final_coefficients(scene: Scene, outcome: Outcome) -> list[tuple[Array, Arra
 
 def probabilities(found: Ranked, scan: Sequence[Ranked], threshold: float) -> tuple[float, float]:
     """Of the effect on its joints, and of its group there; nothing at all counts as a gain of the threshold."""
-    best = {r.candidate.key + ((type(r.candidate.hypothesis).__name__,) if not r.candidate.named else ()): r for r in scan}
+    best = {
+        r.candidate.key + ((type(r.candidate.hypothesis).__name__,) if not r.candidate.named else ()): r for r in scan
+    }
     best[found.candidate.key] = found
     gains = {key: r.gain for key, r in best.items() if np.isfinite(r.gain)}
     top = max([*gains.values(), threshold])
@@ -88,7 +90,11 @@ def _finding(
     rivals = [r for r in scan if r.candidate.key != candidate.key][:SHOWN]
     shown = [Rival(str(r.candidate.hypothesis.effect), _names(scene, r), float(r.gain)) for r in rivals if r.gain > 0]
     nearest = next((r for r in rivals if r.candidate.named), None)
-    margin = f"; {found.gain - max(nearest.gain, 0):.0f} nats ahead of {nearest.candidate.hypothesis.effect}" if nearest else ""
+    margin = (
+        f"; {found.gain - max(nearest.gain, 0):.0f} nats ahead of {nearest.candidate.hypothesis.effect}"
+        if nearest
+        else ""
+    )
     return Finding(
         effect=str(h.effect),
         group=h.group,
@@ -113,7 +119,9 @@ def _rivals(one: Ranked, other: Ranked) -> bool:
 def _with_forms(scene: Scene, stage: Stage, found: Ranked, own: list[Parameter]) -> list[Parameter]:
     """Parameters with the spread over neighbouring forms that fit within `FORMS_NATS`."""
     candidate = found.candidate
-    thetas = [t for step in (2.0, 1.0) for t in candidate.hypothesis.near(scene, candidate.joint, candidate.theta, step)]
+    thetas = [
+        t for step in (2.0, 1.0) for t in candidate.hypothesis.near(scene, candidate.joint, candidate.theta, step)
+    ]
     b = candidates.batch(scene, candidate.hypothesis, candidate.joint, thetas)
     if b is None:
         return own
@@ -176,8 +184,8 @@ def of_event(scene: Scene, event: Event) -> Finding:
         gain_nats=float(event.z),
         rivals=[],
         because=(
-            f"a torque of up to {abs(event.torque_Nm):.3g} {'N' if scene.model.geometry.prismatic[event.joint] else 'N·m'}"
-            f" from {event.time_s[0]:.2f} to {event.time_s[1]:.2f} s that the motion did not have at any other time"
+            f"a torque of up to {abs(event.torque_Nm):.3g}"
+            f" {'N' if scene.model.geometry.prismatic[event.joint] else 'N·m'} from {event.time_s[0]:.2f} to {event.time_s[1]:.2f} s that the motion did not have at any other time"
         ),
         cost_Nm=[abs(event.torque_Nm)],
         time_s=event.time_s,
@@ -208,8 +216,8 @@ def of_line(scene: Scene, line: Line) -> Finding:
         gain_nats=float(line.ratio),
         rivals=[],
         because=(
-            f"a line at {line.frequency_Hz:.2f} Hz, {line.ratio:.0f} times the noise beside it, that differs from period"
-            " to period of the motion"
+            f"a line at {line.frequency_Hz:.2f} Hz, {line.ratio:.0f} times the noise beside it, that differs from"
+            " period to period of the motion"
         ),
         cost_Nm=[line.amplitude_Nm / np.sqrt(2)],
     )

@@ -38,7 +38,7 @@ class Stribeck(Hypothesis):
         return np.asarray((fall * scene.sign(view, joint))[:, None])
 
     def plausible(self, scene: Scene, joint: int, theta: Theta, c: Array) -> Flags:
-        return positive(c) & (c[0] < 4 * scene.coulomb[joint] + 6 * np.sqrt(scene.floor[joint]))
+        return np.asarray(positive(c) & (c[0] < 4 * scene.coulomb[joint] + 6 * np.sqrt(scene.floor[joint])))
 
     def near(self, scene: Scene, joint: int, theta: Theta, step: float) -> list[Theta]:
         speeds = scaled(theta, "speed", (1 / (1 + 0.3 * step), 1.0, 1 + 0.3 * step))
@@ -204,7 +204,9 @@ class Temperature(Hypothesis):
 
     @staticmethod
     def _sensor(scene: Scene, joint: int) -> Array:
-        return np.concatenate([v.motion.temperature_C[:, joint] for v in scene.views if v.motion.temperature_C is not None])
+        return np.concatenate(
+            [v.motion.temperature_C[:, joint] for v in scene.views if v.motion.temperature_C is not None]
+        )
 
     @staticmethod
     def _viscous(scene: Scene, joint: int) -> float:

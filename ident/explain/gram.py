@@ -1,6 +1,6 @@
 """Scores of many candidate columns at once: gain in likelihood on motion held out, less what it costs to believe."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,16 +57,16 @@ class Stage:
         J = len(self.W)
         gram = [[self.W[j][rows[j]].T @ self.W[j][rows[j]] for j in range(J)] for rows in self.test]
         cross = [[self.W[j][rows[j]].T @ self.Y[j][rows[j]] for j in range(J)] for rows in self.test]
-        self._gram_fold = [sum(g) for g in gram]
-        A = sum(self._gram_fold) + np.diag(precision)
-        b = sum(sum(c) for c in cross)
+        self._gram_fold = [_sum(g) for g in gram]
+        A = _sum(self._gram_fold) + np.diag(precision)
+        b = _sum([_sum(c) for c in cross])
         self._factor = linalg.cho_factor(A, lower=True)
         self.phi = linalg.cho_solve(self._factor, b)
         self._gram = gram
         self._factors, self._left, self._rss, self._count, self._cross_left = [], [], [], [], []
         for k, rows in enumerate(self.test):
             factor = linalg.cho_factor(A - self._gram_fold[k], lower=True)
-            phi = linalg.cho_solve(factor, b - sum(cross[k]))
+            phi = linalg.cho_solve(factor, b - _sum(cross[k]))
             self._factors.append(factor)
             left_test = [self.Y[j][rows[j]] - self.W[j][rows[j]] @ phi for j in range(J)]
             self._left.append([self.Y[j] - self.W[j] @ phi for j in range(J)])
@@ -94,11 +94,11 @@ class Stage:
         D = self.Y[0].shape[1]
         WC = [{j: self.W[j][rows[j]].T @ c[rows[j]] for j, c in flat.items()} for rows in self.test]
         CC = [{j: _blocks(c[rows[j]], c[rows[j]], G, m) for j, c in flat.items()} for rows in self.test]
-        WC_all = sum(sum(part.values()) for part in WC)
-        CC_all = sum(sum(part.values()) for part in CC)
+        WC_all = _sum([_sum(part.values()) for part in WC])
+        CC_all = _sum([_sum(part.values()) for part in CC])
         V = linalg.cho_solve(self._factor, WC_all)
         S = _ridged(CC_all - _blocks(WC_all, V, G, m))
-        g = sum(c.T @ self.residual(j) for j, c in flat.items()).reshape(G, m, D)
+        g = _sum([c.T @ self.residual(j) for j, c in flat.items()]).reshape(G, m, D)
         inverse = np.linalg.inv(S)
         c_all = inverse @ g
         phi_V = (self.phi * self.precision[:, None]).T @ V  # (D, G m)
@@ -107,7 +107,7 @@ class Stage:
         surprise -= 0.5 * np.einsum("gmd,gmk,gkd->gd", c_all, VV, c_all)
         gain = np.zeros((G, D))
         for k, rows in enumerate(self.test):
-            gain += self._fold_gain(k, rows, flat, WC_all - sum(WC[k].values()), CC_all - sum(CC[k].values()), CC[k])
+            gain += self._fold_gain(k, rows, flat, WC_all - _sum(WC[k].values()), CC_all - _sum(CC[k].values()), CC[k])
         std = np.sqrt(np.maximum(np.einsum("gmm->gm", inverse), 0.0))
         return Scores(gain + surprise, gain, c_all, std)
 
@@ -150,10 +150,16 @@ class Stage:
         return gain
 
 
+def _sum(arrays: Iterable[Array]) -> Array:
+    return np.asarray(np.sum(list(arrays), axis=0))
+
+
 def _blocks(a: Array, b: Array, G: int, m: int) -> Array:
     """Diagonal blocks of a' b: shape (G, m, m)."""
     n = len(a)
-    return np.einsum("ngi,ngk->gik", a.reshape(n, G, m), b.reshape(n, G, m), optimize=True)
+    if G == 1:
+        return (a.T @ b)[None]
+    return np.asarray(np.einsum("ngi,ngk->gik", a.reshape(n, G, m), b.reshape(n, G, m)))
 
 
 def _ridged(S: Array) -> Array:

@@ -81,9 +81,7 @@ def scaled(theta: Theta, key: str, factors: Sequence[float]) -> list[Theta]:
     return [{**theta, key: theta[key] * f} for f in factors]
 
 
-def parameter(
-    scene: Scene, joint: int, effect: Effect, name: str, value: float, std: float
-) -> Parameter:
+def parameter(scene: Scene, joint: int, effect: Effect, name: str, value: float, std: float) -> Parameter:
     """Parameter of the shared vocabulary, with the unit of this kind of joint."""
     kind = next(p for p in EFFECT_KINDS[effect].parameters if p.name == name)
     unit = kind.unit

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.explain import rows, scene as scenes
+from ident.explain import rows
+from ident.explain import scene as scenes
 from ident.explain.candidates import Ranked
 from ident.explain.contract import Levels, finite
 from ident.explain.motion import Motion

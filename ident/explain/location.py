@@ -109,7 +109,9 @@ def locate(scene: Scene, stage: Stage, joint: int, ratio: float) -> Located:
         regime = lead.name + (" × direction" if lead.odd else "")
         turn = " and changes sign with direction" if lead.odd else ""
         words = f"{100 * lead.share:.0f} % of that excess is ordered by {lead.name}{turn}"
-    sentence = f"{name}: residual {ratio:.3g} times the noise power; {words}; worst at {when[0]:.1f} to {when[1]:.1f} s."
+    sentence = (
+        f"{name}: residual {ratio:.3g} times the noise power; {words}; worst at {when[0]:.1f} to {when[1]:.1f} s."
+    )
     cells = [Cell(f.name, 100 * f.share, f.odd) for f in found]
     return Located(
         joint=name,

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator import simulator
 from ident import auxiliary
 from ident.explain.judge import Model3
 from ident.explain.motion import Run
@@ -57,7 +58,9 @@ def closed_loop(models: Model3, runs: Sequence[Run], views: Sequence[View]) -> C
                 size += float((measured[skip:] ** 2).sum())
                 count += len(t) - skip
                 for level, theta in enumerate((models.refitted, models.explained)):
-                    extra = _extra(models, [v for v in views if v.motion.run == index], t) if level else np.zeros(q.shape)
+                    extra = (
+                        _extra(models, [v for v in views if v.motion.run == index], t) if level else np.zeros(q.shape)
+                    )
                     simulated_q, simulated_tau = _simulate(models, stretch, theta, extra)
                     position[level] += ((simulated_q - q)[skip:] ** 2).sum(axis=0)
                     torque[level] += float(((simulated_tau - measured)[skip:] ** 2).sum())
@@ -86,8 +89,8 @@ def _simulate(models: Model3, stretch: auxiliary.Stretch, theta: Array, extra: A
     early = np.arange(len(extra)) + (0.0 if stretch.by_drives else LEAD)
     ahead = np.column_stack([np.interp(early, np.arange(len(extra)), x) for x in extra.T])
     moved = stretch.reference.q - np.linalg.solve(stiffness, ahead.T).T
-    reference = auxiliary.simulator.reference_of(moved, step)
-    simulation = auxiliary.simulator.simulate(
+    reference = simulator.reference_of(moved, step)
+    simulation = simulator.simulate(
         model.geometry,
         auxiliary.dynamics(model, theta),
         law,
@@ -98,4 +101,3 @@ def _simulate(models: Model3, stretch: auxiliary.Stretch, theta: Array, extra: A
     # the torque of a row is the mean over the period before it
     torque = np.vstack([simulation.tau_Nm[:1], simulation.tau_Nm[:-1]]) + extra
     return simulation.q, torque
-

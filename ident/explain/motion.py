@@ -144,8 +144,8 @@ def clipped(runs: Sequence[Run]) -> list[str]:
             longest = max((sum(1 for _ in g) for k, g in itertools.groupby(extreme) if k), default=0)
             if longest >= CLIPPED and np.ptp(tau) > 0:
                 notes.append(
-                    f"{run.signals.source}: the torque of {name} stands at its extreme of {np.abs(tau).max():.3g} N·m for"
-                    f" {longest} samples in a row; a saturated drive or a clipped signal. What happens there is not"
+                    f"{run.signals.source}: the torque of {name} stands at its extreme of {np.abs(tau).max():.3g} N·m"
+                    f" for {longest} samples in a row; a saturated drive or a clipped signal. What happens there is not"
                     " seen: record with smaller accelerations."
                 )
     return notes
@@ -162,8 +162,9 @@ def _of_segment(run: Run, index: int, segment: Segment, period_s: float, *, fold
     if found is None:
         return [_single(run, index, segment, period_s, factor)]
     out = [_repeated(run, index, segment, period_s, factor, found)]
-    if T - found.end > found.period // 2 and _moves(segment, slice(found.end, T)):
-        out += _of_segment(run, index, _cut(segment, slice(found.end, T)), period_s, fold=fold)
+    rest = slice(found.high, T)
+    if T - found.high > found.period // 2 and _moves(segment, rest):
+        out += _of_segment(run, index, _cut(segment, rest), period_s, fold=fold)
     return out
 
 
@@ -187,13 +188,11 @@ def _moves(segment: Segment, rows: slice) -> bool:
 
 
 def _cut(segment: Segment, rows: slice) -> Segment:
-    return Segment(
-        segment.t_s[rows], segment.q[rows], segment.qd[rows], segment.qdd[rows], segment.tau_Nm[rows]
-    )
+    return Segment(segment.t_s[rows], segment.q[rows], segment.qd[rows], segment.qdd[rows], segment.tau_Nm[rows])
 
 
 def _single(run: Run, index: int, segment: Segment, period_s: float, factor: int) -> Motion:
-    tau = _smoothed(segment.tau_Nm, factor, circular=False)
+    tau = _smoothed(segment.tau_Nm, factor)
     pick = slice(None, None, factor)
     t = segment.t_s[pick]
     J = tau.shape[1]
@@ -216,43 +215,49 @@ def _single(run: Run, index: int, segment: Segment, period_s: float, factor: int
 
 
 def _repeated(
-    run: Run, index: int, segment: Segment, period_s: float, factor: int, found: period.Repetition
+    run: Run, index_of_run: int, segment: Segment, period_s: float, factor: int, found: period.Repetition
 ) -> Motion:
     P, L = found.count, found.period
-    rows = slice(found.start, found.end)
-
-    def fold(values: Array) -> Array:
-        return np.asarray(values[rows].reshape(P, L, -1))
-
+    rows = found.start + np.arange(P * L)
+    used = ((rows >= found.low) & (rows < found.high)).reshape(P, L)
+    index = np.clip(rows, 0, segment.t_s.size - 1).reshape(P, L)
     pick = slice(None, None, factor)
-    tau = np.stack([_smoothed(one, factor, circular=True) for one in fold(segment.tau_Nm)])[:, pick]
-    q, qd, qdd = (fold(v)[:, pick] for v in (segment.q, segment.qd, segment.qdd))
-    t = segment.t_s[rows].reshape(P, L)[:, pick]
+
+    def fold(values: Array) -> tuple[Array, Array]:
+        """Mean over the periods, shape (T, J), and what each differs by, (P, T, J); start-up is that mean."""
+        each = values[index[:, pick]]
+        live = used[:, pick, None]
+        mean = (each * live).sum(axis=0) / live.sum(axis=0)
+        return mean, (each - mean) * live
+
+    (q, _), (qd, _), (qdd, each_qdd) = (fold(v) for v in (segment.q, segment.qd, segment.qdd))
+    tau, each_tau = fold(_smoothed(segment.tau_Nm, factor))
+    t = (segment.t_s[0] + period_s * rows.reshape(P, L))[:, pick]
     return Motion(
         source=run.signals.source,
-        run=index,
+        run=index_of_run,
         clock_s=run.start_s + t.mean(axis=0),
         t_s=t[0],
         dt_s=period_s * factor,
-        q=q.mean(axis=0),
-        qd=qd.mean(axis=0),
-        qdd=qdd.mean(axis=0),
-        tau_Nm=tau.mean(axis=0),
+        q=q,
+        qd=qd,
+        qdd=qdd,
+        tau_Nm=tau,
         periods=P,
         circular=True,
-        each_tau=tau - tau.mean(axis=0),
-        each_qdd=qdd - qdd.mean(axis=0),
+        each_tau=each_tau,
+        each_qdd=each_qdd,
         temperature_C=_temperature(run, t),
     )
 
 
-def _smoothed(tau: Array, factor: int, *, circular: bool) -> Array:
+def _smoothed(tau: Array, factor: int) -> Array:
     """Zero-phase low-pass that lets every `factor`-th sample be picked; the same length."""
     if factor == 1:
         return tau
     taps = signal.firwin(8 * factor + 1, 0.7 / factor)
     half = 4 * factor
-    padded = np.pad(tau, ((half, half), (0, 0)), mode="wrap" if circular else "edge")
+    padded = np.pad(tau, ((half, half), (0, 0)), mode="edge")
     return np.asarray(signal.oaconvolve(padded, taps[:, None], mode="valid", axes=0))
 
 

@@ -14,19 +14,26 @@ MOVING = 0.02  # share of the peak speed above which a joint moves
 LIVELY = 0.3  # share of the time that something must move: a standstill repeats at every lag
 
 
+HEAD_S, TAIL_S = 0.4, 0.15  # of a periodic stretch in which the loop still settles, or already stops
+WHOLE = 0.5  # share of a period from which on a partial one is used where the others can fill it
+
+
 @dataclass(frozen=True)
 class Repetition:
     """Rows start, start + period, ... repeat.
 
     Attributes:
-        start: First row of the first whole period after the transient.
+        start: First row of the first period; may lie before `low`.
         period: Rows per period.
-        count: Whole periods, at least 2.
+        count: Periods, at least 2.
+        low, high: Rows outside of these belong to start-up or stop and are not used.
     """
 
     start: int
     period: int
     count: int
+    low: int
+    high: int
 
     @property
     def end(self) -> int:
@@ -34,7 +41,7 @@ class Repetition:
 
 
 def find(q: Array, rate_Hz: float) -> Repetition | None:
-    """Longest periodic stretch of positions of shape (T, J), without its start-up transient; None if nothing repeats."""
+    """Longest periodic stretch of positions of shape (T, J), without start-up and stop; None if nothing repeats."""
     span = np.ptp(q, axis=0)
     moving = span > 1e-6
     if not moving.any():
@@ -61,11 +68,12 @@ def find(q: Array, rate_Hz: float) -> Repetition | None:
     lag, start, end = best
     start, end = start * factor, min(end * factor, len(q))
     period = _refined(q[start:end, moving] / span[moving], lag * factor, factor)
-    count = int((end - start + 0.03 * period) // period)
-    start = max(0, end - count * period)
-    if start + count * period > len(q):
-        count -= 1
-    return Repetition(start, period, count) if count >= 2 else None
+    low, high = start + round(HEAD_S * rate_Hz), end - round(TAIL_S * rate_Hz)
+    if high - low < (1 + WHOLE) * period:  # hardly two periods: better a little transient than no repetition
+        low, high = start, end
+    count = int((high - low) // period)
+    count += int((high - low) - count * period > WHOLE * period)
+    return Repetition(high - count * period, period, count, low, high) if count >= 2 else None
 
 
 def _refined(q: Array, lag: int, reach: int) -> int:

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ident.explain.candidates import Ranked
 from ident.explain.compete import Competition
 from ident.explain.contract import Experiment, Power
-from ident.explain.candidates import Ranked
 from ident.explain.scene import Scene
 
 Array = NDArray[np.float64]

@@ -62,7 +62,7 @@ class Lowpass:
         spectrum = np.abs(np.fft.rfft(middle[middle != 0], 8192)) ** 2
         full = np.fft.irfft(spectrum)
         step = int(self.at[1] - self.at[0]) if len(self.at) > 1 else 1
-        r = full[: 4096 : step] / full[0]
+        r = full[:4096:step] / full[0]
         return float(1 / (1 + 2 * (r[1:] ** 2).sum()))
 
     @cached_property
@@ -83,7 +83,9 @@ def soft_speed(motions: Sequence[Motion]) -> Array:
     At least three times the noise of the speed, which is what a second difference of it shows.
     """
     peak = np.max([np.abs(m.qd).max(axis=0) for m in motions], axis=0)
-    noise = np.max([1.4826 * np.median(np.abs(np.diff(m.qd, n=3, axis=0)), axis=0) / np.sqrt(20) for m in motions], axis=0)
+    noise = np.max(
+        [1.4826 * np.median(np.abs(np.diff(m.qd, n=3, axis=0)), axis=0) / np.sqrt(20) for m in motions], axis=0
+    )
     return np.asarray(np.maximum(np.maximum(SOFT * peak, 3 * noise), 1e-9))
 
 
@@ -94,8 +96,8 @@ def standing(motion: Motion, low: Lowpass, peak: Array) -> NDArray[np.bool_]:
     pad = max(1, round(DWELL_PAD_S / motion.dt_s))
     out = np.zeros((len(low.at), slow.shape[1]), dtype=bool)
     for j, column in enumerate(slow.T):
-        dwell = ndimage.binary_opening(column, np.ones(least))
-        out[:, j] = ndimage.binary_dilation(dwell, np.ones(2 * pad + 1))[low.at] if dwell.any() else False
+        dwell = ndimage.binary_opening(column, np.ones(least, dtype=bool))
+        out[:, j] = ndimage.binary_dilation(dwell, np.ones(2 * pad + 1, dtype=bool))[low.at] if dwell.any() else False
     return out
 
 
@@ -124,14 +126,14 @@ def repeat_noise(motion: Motion, low: Lowpass, inertia: Array) -> Array | None:
 
 
 def spectral_noise(residual: Array, dt_s: float, low: Lowpass) -> Array:
-    """Variance in the band of noise that is white up to three times the band, from what lies above the band, shape (J,).
+    """Variance in the band, shape (J,), of noise that is white: from what lies up to two times above the band.
 
     Args:
         residual: At the inner rate, shape (T, J).
     """
     rate = 1 / dt_s
     band = rate / (2 * max(1, int(low.at[1] - low.at[0])))
-    frequency, density = signal.welch(residual, rate, nperseg=min(256, len(residual)), axis=0, detrend="linear")
+    frequency, density = signal.welch(residual, rate, nperseg=min(256, len(residual)), axis=0)
     above = (frequency > 1.3 * band) & (frequency < min(3 * band, 0.45 * rate))
     if not above.any():
         above = frequency > 0.5 * frequency[-1]

@@ -210,9 +210,7 @@ def coulomb_level(model: Model, theta: Array) -> Array:
     return np.array([abs(value[f"Fc{j + 1}"]) for j in range(model.joints)])
 
 
-def view(
-    model: Model, motion: Motion, low: Lowpass, theta: Array, soft: Array, mass: Array | None = None
-) -> View:
+def view(model: Model, motion: Motion, low: Lowpass, theta: Array, soft: Array, mass: Array | None = None) -> View:
     """A motion with the base model's torques on it.
 
     Args:
@@ -252,7 +250,7 @@ def _fit(W: Sequence[Array], y: Sequence[Array], weight: Sequence[Array]) -> Arr
         scaled = Wj * wj[:, None]
         A += scaled.T @ scaled
         b += scaled.T @ (yj * wj)
-    return np.linalg.solve(A, b)
+    return np.asarray(np.linalg.solve(A, b), dtype=float)
 
 
 def _folds(counts: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -23,7 +23,15 @@ def dahl(step: Array, reach: Array, *, circular: bool) -> Array:
 
 
 def elastic_torque(
-    motor: Array, inertia: Array, other: Array, dt: float, stiffness: Array, damping: Array, gap: Array, *, circular: bool
+    motor: Array,
+    inertia: Array,
+    other: Array,
+    dt: float,
+    stiffness: Array,
+    damping: Array,
+    gap: Array,
+    *,
+    circular: bool,
 ) -> Array:
     """Torque through a transmission whose far side swings: J qL'' + other = tau, tau = K dz(theta - qL, gap) + D (...).
 
@@ -38,8 +46,8 @@ def elastic_torque(
     """
     omega = np.sqrt(stiffness / inertia.min())
     substeps = np.maximum(1, np.ceil(omega * dt / FINEST_RAD)).astype(np.int64)
-    arrays = (np.ascontiguousarray(a) for a in (motor, inertia, other))
-    return np.asarray(_elastic(*arrays, dt, stiffness, damping, gap, substeps, 2 if circular else 1))
+    near, mass, load = (np.ascontiguousarray(a) for a in (motor, inertia, other))
+    return np.asarray(_elastic(near, mass, load, dt, stiffness, damping, gap, substeps, 2 if circular else 1))
 
 
 def lag(source: Array, dt: float, time_s: float, start: float) -> Array:

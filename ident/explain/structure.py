@@ -188,4 +188,3 @@ def _tilted(scene: Scene, view: View, links: Array, axis: int) -> Array:
 
 
 STRUCTURE: tuple[Hypothesis, ...] = (Payload(), Tilt(), BaseFlexibility())
-

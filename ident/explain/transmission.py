@@ -10,6 +10,7 @@ from ident.explain import states
 from ident.explain.contract import Parameter
 from ident.explain.hypothesis import Flags, Hypothesis, Theta, parameter, scaled, within
 from ident.explain.scene import Scene, View
+from protocols.effects import Effect
 
 Array = NDArray[np.float64]
 
@@ -22,10 +23,10 @@ HEAVIER = 5.0  # rotor inertias: a link lighter than 1/5 of its rotor does not s
 class Elasticity(Hypothesis):
     """A spring between motor and link: the link swings behind the motor."""
 
-    effect = "transmission.elasticity"
+    effect: ClassVar[Effect] = "transmission.elasticity"
     group = "elastic gear"
     signature = "torque near a resonance that no static variable organises; grows with acceleration"
-    experiments = ("chirp",)
+    experiments: ClassVar[tuple[str, ...]] = ("chirp",)
 
     def grid(self, scene: Scene, joint: int) -> Sequence[Theta]:
         if scene.views[0].link_inertia[:, joint].max() <= 0:
@@ -154,7 +155,7 @@ class Coupling(Hypothesis):
         speed = view.motion.qd @ row
         soft = float(np.hypot(scene.soft[joint], theta["ratio"] * scene.soft[other]))
         both = np.column_stack([np.tanh(speed / soft), speed / max(scene.peak[joint], 1e-9)])
-        return row[:, None, None] * both
+        return np.asarray(row[:, None, None] * both)
 
     def plausible(self, scene: Scene, joint: int, theta: Theta, c: Array) -> Flags:
         return np.asarray((c[0] >= 0) & (c[1] > -0.5 * np.abs(c[0])))
@@ -220,4 +221,3 @@ class CubicSpring(Spring):
 
 
 TRANSMISSION: tuple[Hypothesis, ...] = (Elasticity(), Backlash(), Efficiency(), Coupling(), Spring(), CubicSpring())
-

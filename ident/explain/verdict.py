@@ -29,7 +29,7 @@ class Ruling:
     trust: bool = True
 
 
-def rule(
+def rule(  # noqa: PLR0911  (one return per verdict)
     scene: Scene,
     found: Sequence[Finding],
     left: Sequence[Unexplained],
@@ -70,7 +70,9 @@ def rule(
             moved,
         )
     if gone >= ENOUGH or np.all((after <= healthy) | ~np.isfinite(after)):
-        return Ruling("explained", f"Left out was {names}; with it {100 * min(gone, 1):.0f} % of the excess is gone.", moved)
+        return Ruling(
+            "explained", f"Left out was {names}; with it {100 * min(gone, 1):.0f} % of the excess is gone.", moved
+        )
     return Ruling(
         "partly", f"Left out was {names}; {100 * gone:.0f} % of the excess is gone, the rest is below.", moved
     )
@@ -103,7 +105,7 @@ def _not_a_torque(scene: Scene, outcome: Outcome) -> list[str]:
 
 
 def _parameters_moved(scene: Scene, figures: BeforeAfter) -> list[str]:
-    """"Parameters wrong, structure right", where it is so."""
+    """ "Parameters wrong, structure right", where it is so."""
     theta, sigma = scene.prior.theta, scene.prior.sigma
     known = (sigma > 0) & ~np.isin(
         [int(n.lstrip("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz_")) - 1 for n in scene.model.names],
