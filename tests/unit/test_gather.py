@@ -38,19 +38,21 @@ def test_the_index_gives_what_a_walk_gives(file: bytes) -> None:
     assert len(read(indexed)[topics.CYCLE][1]) == 2000
 
 
-@pytest.mark.parametrize("damage", ["beyond", "shifted", "swapped", "short"])
+@pytest.mark.parametrize("damage", ["beyond", "shifted", "other channel", "short", "twice"])
 def test_an_index_that_lies_is_not_believed(file: bytes, damage: str) -> None:
     contents = scan(file)
-    shared = [chunk for chunk in contents.chunks if len(chunk.offset) > 1]
-    assert shared
-    for chunk in shared:
-        a, b = sorted(chunk.offset)[:2]
-        if damage == "beyond":
-            chunk.offset[a] = chunk.offset[a] + np.uint64(2**62)
-        elif damage == "shifted":
-            chunk.offset[a] = chunk.offset[a] + np.uint64(1)
-        elif damage == "swapped":
-            chunk.offset[a], chunk.offset[b] = chunk.offset[b], chunk.offset[a]
-        else:
-            chunk.offset[a] = chunk.offset[a][:-1]
+    channels = sorted(contents.channels)
+    for chunk in contents.chunks:
+        for channel, offset in list(chunk.offset.items()):
+            if damage == "beyond":
+                chunk.offset[channel] = offset + np.uint64(2**62)
+            elif damage == "shifted":
+                chunk.offset[channel] = offset + np.uint64(1)
+            elif damage == "other channel":
+                del chunk.offset[channel]
+                chunk.offset[channels[channels.index(channel) - 1]] = offset
+            elif damage == "short":
+                chunk.offset[channel] = offset[:-1]
+            else:
+                chunk.offset[channel] = np.append(offset, offset[-1])
     assert same(contents, scan(file))
