@@ -169,6 +169,7 @@ def of_event(scene: Scene, event: Event) -> Finding:
     """A contact."""
     joint = scene.model.robot.joint[event.joint].name
     duration = event.time_s[1] - event.time_s[0]
+    unit = "N" if scene.model.geometry.prismatic[event.joint] else "N·m"
     noise = float(np.sqrt(scene.floor[event.joint]))
     return Finding(
         effect="contact",
@@ -184,8 +185,8 @@ def of_event(scene: Scene, event: Event) -> Finding:
         gain_nats=float(event.z),
         rivals=[],
         because=(
-            f"a torque of up to {abs(event.torque_Nm):.3g}"
-            f" {'N' if scene.model.geometry.prismatic[event.joint] else 'N·m'} from {event.time_s[0]:.2f} to {event.time_s[1]:.2f} s that the motion did not have at any other time"
+            f"a torque of up to {abs(event.torque_Nm):.3g} {unit} from {event.time_s[0]:.2f} to {event.time_s[1]:.2f} s"
+            " that the motion did not have at any other time"
         ),
         cost_Nm=[abs(event.torque_Nm)],
         time_s=event.time_s,
