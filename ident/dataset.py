@@ -22,6 +22,7 @@ NYQUIST_SHARE = 0.9  # a cut-off above this share of half the rate filters nothi
 SETTLE = 5.0  # periods of the cut-off after which the ends of the filter disturb accelerations by less than 1e-4
 FORGET = 15.5  # periods of the cut-off in which the filter forgets by 1e-16: 37 / (2 pi cos(3 pi / 8))
 PIECE = 65536  # rows filtered at a time: 6 axes are 25 MB, and the margins cost 5 % at 5 kHz and 50 Hz
+SLOWEST_S = 0.05  # period above which no motion of an arm is seen
 STENCIL = 2  # samples either side of the five-point differences
 
 
@@ -243,8 +244,13 @@ def _check_times(signals: Signals, steps: Array, period: float) -> None:
     if not (steps > 0).all():
         at = int(np.argmin(steps))
         raise DataError(
-            f"{signals.source}: time goes from {signals.t_s[at]:.6f} s to {signals.t_s[at + 1]:.6f} s;"
-            " times must increase."
+            f"{signals.source}: time goes from {signals.t_s[at]:.6f} s to {signals.t_s[at + 1]:.6f} s, sample {at + 1}"
+            f" of {signals.t_s.size}; times must increase. Sort or cut the recording there."
+        )
+    if period > SLOWEST_S:
+        raise DataError(
+            f"{signals.source}: one sample every {period:g} s is too slow for any arm; times must be in seconds, and"
+            " these may be in milliseconds or nanoseconds. Divide them."
         )
     uneven = (np.abs(steps - period) > JITTER * period) & (steps <= GAP * period)
     if uneven.any():

@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 
 DEFICIENT = 1e-8  # singular value, columns scaled to 1, below which a motion does not show a combination
 ROUNDING = 1e-13  # of the largest column: smaller ones are zeros of the structure
+NEGATIVE = 3.0  # standard deviations below zero from which on a parameter is called negative
 SHOWN_SHARE = 0.1  # weight of a parameter in an unseen combination from which on it is named
 
 
@@ -222,6 +223,7 @@ def assemble(
         notes=[
             *(n for o in observations for n in o.notes),
             *_autocorrelation_note(observations[0].joints, lag1, covariance_name),
+            *negative_notes(base, beta, np.sqrt(np.diag(covariance)), observations[0].joints),
             *notes,
         ],
         iterations=iterations,
@@ -269,6 +271,12 @@ def refuse_deficient(A: Array, base: Base, observations: Sequence[Observation]) 
     Raises:
         IdentificationError: There are such parameters; names them.
     """
+    rows = sum(o.used.size for o in observations)
+    if rows < len(base.names):
+        raise IdentificationError(
+            f"{rows} rows at {observations[0].rate_Hz:.0f} Hz for {len(base.names)} parameters. Record longer, or"
+            " decimate less."
+        )
     refuse_hidden(A, base, " ".join(n for o in observations for n in o.notes if "moved by only" in n))
 
 
@@ -307,3 +315,30 @@ def _autocorrelation_note(joints: list[str], lag1: Array, covariance: str) -> li
     values = ", ".join(f"{name} {value:+.2f}" for name, value in zip(joints, lag1, strict=True))
     allowed = "assume that there is none" if covariance.startswith("white") else "allow for it, eq. (8) does not"
     return [f"Residual autocorrelation at lag 1: {values}. The standard deviations {allowed}."]
+
+
+def negative_notes(base: Base, beta: Array, std: Array, joints: Sequence[str]) -> list[str]:
+    """Frictions and rotor inertias far below zero, which no axis has: most often a sign in the data."""
+    found: dict[int, list[str]] = {}
+    kinds: dict[int, set[str]] = {}
+    for index, value, deviation in zip(base.kept, beta, std, strict=True):
+        name = base.standard[index]
+        kind = name.rstrip("0123456789")
+        number = int(name[len(kind) :])
+        axis = kind in ("Fv", "Fc", "Ia") or (kind == "ZZ" and number == 1)
+        if axis and value < -NEGATIVE * deviation:
+            found.setdefault(number - 1, []).append(f"{name} = {value:.3g} ± {deviation:.2g}")
+            kinds.setdefault(number - 1, set()).add(kind)
+    notes = []
+    for j, words in sorted(found.items()):
+        text = f"{joints[j]}: {', '.join(words)} {'are' if len(words) > 1 else 'is'} negative, which no axis can be."
+        if {"Fv", "Fc"} <= kinds[j]:
+            text += (
+                " Torque and position of this axis have opposite signs: check gear_ratio and the sign of the current."
+            )
+        else:
+            text += (
+                " The motion may not show it, or the model lacks an effect: look at its deviation and the residuals."
+            )
+        notes.append(text)
+    return notes

@@ -10,6 +10,7 @@ from scipy import signal
 from ident.base import Base
 from ident.dataset import Dataset, Segment
 from ident.model import Model
+from ident.units import check_units
 from protocols.errors import ConfigError, DataError
 
 Array = NDArray[np.float64]
@@ -99,8 +100,9 @@ def observe(
 
     Raises:
         ConfigError: More than the sampling rate was asked for.
-        DataError: No stretch is long enough to decimate.
+        DataError: No stretch is long enough to decimate, or positions are not the joints' in rad.
     """
+    units = check_units(dataset, model.robot)
     rate = 1 / dataset.period_s
     if np.isfinite(decimate_to_Hz) and decimate_to_Hz > 1.0001 * rate:
         raise ConfigError(f"decimate_to_Hz = {decimate_to_Hz:g} is more than the {rate:.0f} Hz of {dataset.source}.")
@@ -122,7 +124,7 @@ def observe(
     times, W, y, used = zip(*parts, strict=True)
     first = np.concatenate([np.arange(t.size) == 0 for t in times])
     keep = np.concatenate(used, axis=1)
-    notes = list(dataset.notes)
+    notes = [*dataset.notes, *units]
     for name, span in zip(np.array(dataset.joints)[still], dataset.span()[still], strict=True):
         notes.append(f"{dataset.source}: {name} moved by only {span:.2g} rad; its rows are not used.")
     if len(parts) < len(dataset.segments):

@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 
 ESSENTIAL_PERCENT = 30.0  # relative standard deviation above which a parameter may be dropped (paper, IV.C)
 LEVEL = 0.05  # of the F test
+CONFUSED = 0.95  # correlation of two estimates from which on they are one combination
 
 
 @dataclass(frozen=True)
@@ -72,3 +73,26 @@ def reduce(estimate: Estimate) -> Reduction:
         p_value = float(stats.f.sf(F, dropped, freedom))
         result = Reduction(essential.copy(), beta, std, float(F), limit, p_value, stopped_by_F=False)
     return result
+
+
+def unshown(estimate: Estimate, reduction: Reduction) -> list[str]:
+    """Which parameters this motion cannot show, in words: too small to matter, or not told apart from others."""
+    out = []
+    names, base = estimate.base.names, estimate.base
+    std = np.sqrt(np.diag(estimate.covariance))
+    correlation = estimate.covariance / np.outer(std, std)
+    weak = ~reduction.essential
+    for i, k in zip(*np.nonzero(np.triu(np.abs(correlation) > CONFUSED, 1)), strict=True):
+        if weak[i] or weak[k]:
+            out.append(
+                f"This motion hardly tells {names[i]} from {names[k]} (correlation {correlation[i, k]:+.2f}): only a"
+                " combination of them is known. Add poses in which they act differently."
+            )
+    if not weak.any():
+        return out
+    shown = ", ".join(f"{names[i]} {estimate.beta[i]:.3g} ± {std[i]:.2g} {base.units[i]}" for i in np.flatnonzero(weak))
+    text = f"Not to be told from zero, or not needed, on this motion ({int(weak.sum())} of {len(names)}): {shown}."
+    if estimate.system is not None:
+        share = np.linalg.norm(estimate.system.W[:, weak] @ estimate.beta[weak]) / np.linalg.norm(estimate.system.y)
+        text += f" Together they make {100 * share:.2g} % of the torques."
+    return [*out, text]

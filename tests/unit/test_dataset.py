@@ -53,7 +53,7 @@ def test_a_gap_starts_a_new_segment_and_nothing_is_made_up() -> None:
     assert len(dataset.segments) == 2
     assert dataset.segments[0].t_s[-1] < 1.5 <= dataset.segments[1].t_s[0]
     assert all(np.allclose(np.diff(s.t_s), T) for s in dataset.segments)
-    assert "run: 1 gaps" in dataset.notes[0]
+    assert "run: 1 gaps, 0.004 s in all, the longest 0.004 s after 1.499 s" in dataset.notes[0]
 
 
 def test_stretches_too_short_to_filter_are_left_out_and_counted() -> None:
@@ -95,7 +95,7 @@ def broken(what: str) -> Signals:
     [
         ("nan", "run: position of b is not a number in 2 of 4000 samples, first at 0.700 s."),
         ("nan torque", "run: torque of a is not a number in 1 of 4000 samples, first at 0.005 s."),
-        ("back", "run: time goes from 0.099000 s to 0.098000 s; times must increase."),
+        ("back", "run: time goes from 0.099000 s to 0.098000 s, sample 100 of 4000; times must increase. Sort or cut"),
         ("uneven", "run: 2 of 3999 steps differ by more than 2 % from the period of 1.000 ms"),
         ("short", "none with the 409 samples (0.41 s) that the 50 Hz filter needs. Record longer."),
         ("one", "run: 1 samples; a motion of some seconds is needed."),
