@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 WINDOW_S = 0.2
 EVENT = 60.0  # standard deviations of a window's energy
 LINE = 60.0  # times the median of the neighbouring bins; the largest of 10 000 bins of noise reaches 14
+LOWEST_HZ, HIGHEST = 1.5, 0.42  # of lines; of the inner rate: the filters' edge looks like a line
+CERTAIN = 6.0  # standard deviations of a line's amplitude
 NEIGHBOURS = 60  # bins either side
 LONE = 0.5  # share of a single recording's excess that one event must hold
 
@@ -155,13 +157,15 @@ def _lines(scene: Scene, view: View) -> list[Line]:
     for j in range(scene.joints):
         local = ndimage.median_filter(power[:, j], 2 * NEIGHBOURS + 1, mode="nearest")
         ratio = power[:, j] / np.maximum(local, 1e-300)
-        ratio[frequency < 1.5] = 0.0
+        ratio[(frequency < LOWEST_HZ) | (frequency > HIGHEST / m.dt_s)] = 0.0
         at = int(np.argmax(ratio))
         wide = (ratio[max(0, at - NEIGHBOURS) : at + NEIGHBOURS] > 0.1 * ratio[at]).sum()
         least = LINE if m.periods > 1 else 4 * LINE
         if ratio[at] < least or wide > 8:
             continue
-        out.append(_fitted(j, series[:, j], view, float(frequency[at]), float(ratio[at])))
+        line = _fitted(j, series[:, j], view, float(frequency[at]), float(ratio[at]))
+        if line.amplitude_Nm > CERTAIN * line.std_Nm:
+            out.append(line)
     return out
 
 

@@ -17,6 +17,7 @@ DRAWS = 40  # simulated healthy recordings
 LEVEL = 0.99  # of them stay below the threshold
 LEAST_NATS = 10.0  # threshold at least: model errors at reversals are not in the simulated recordings
 CHAIN = 0.04  # share of the gain explained so far that one more effect must bring: forms are never exact
+CHAIN_RIVAL = 0.2  # the same for a rival without physics: it mends the form of what was named
 MOST = 5  # effects on one joint
 ABSTAIN_RATIO, ABSTAIN_NATS = 1.25, 6.0  # by which a rival without physics must win
 LOOK_AHEAD = 6  # effects that are tried as the first of a pair
@@ -89,10 +90,12 @@ class Competition:
             size = np.maximum(sum((block**2).sum(axis=0) for block in blocks), 1e-12)
             W = [np.column_stack([w, block]) for w, block in zip(W, blocks, strict=True)]
             precision = np.concatenate([precision, WIDE * size])
+        # healthy machines differ from their robot file by what its 1-sigma admit
+        believed = self._rng.normal(size=(scene.W[0].shape[1], draws))
         Y = []
         for j, y in enumerate(scene.y):
             live = scene.weight[j] > 0
-            healthy = (scene.W[j] @ scene.phi)[:, None] + self._rng.normal(size=(len(y), draws)) * live[:, None]
+            healthy = scene.W[j] @ believed + self._rng.normal(size=(len(y), draws)) * live[:, None]
             Y.append(np.column_stack([y, healthy]))
         counted = [w > 0 for w in scene.weight]
         return Stage(W, Y, scene.fold, counted, scene.independent, precision)
@@ -147,7 +150,8 @@ class Competition:
         """Above what chance gives, and not a mere correction of the form of what was accepted on the joint before."""
         before = max((explained[j] for j in r.candidate.joints), default=float(explained.max(initial=0.0)))
         least = self.null.named if r.candidate.named else self.null.rival
-        return bool(r.gain >= max(0.7 * least if r.candidate.named else least, CHAIN * before))
+        chain = CHAIN if r.candidate.named else CHAIN_RIVAL
+        return bool(r.gain >= max(0.7 * least if r.candidate.named else least, chain * before))
 
     def _abstains(self, rival: Ranked, ranking: Sequence[Ranked], stage: Stage) -> bool:
         """A rival beats every named effect on its joint (and of the whole arm), refined."""

@@ -15,10 +15,10 @@ Array = NDArray[np.float64]
 AXIS_HZ, ARM_HZ = 62.5, 50.0  # rate of the rows; half of it is the band
 REACH = 6  # rows either side that the low-pass looks at
 CUT = 0.85  # of the band: -6 dB
-DWELL_S, DWELL_PAD_S = 0.08, 0.06  # slower than DEAD for so long is standing; rows so near to it are left out
-DEAD = 0.004  # share of a joint's peak speed
-SOFT = 0.003  # share of a joint's peak speed over which the sign of its speed changes
-KAPPA = 0.3  # share of Coulomb friction that the model of a reversal may be wrong by
+DWELL_S, DWELL_PAD_S = 0.024, 0.03  # slower than DEAD for so long is standing; rows so near to it are left out
+DEAD = 0.008  # share of a joint's peak speed
+SOFT = 0.0007  # share of a joint's peak speed over which the sign of its speed changes
+KAPPA, EARLY_S = 0.3, 0.004  # share of Coulomb friction, and time, that the model of a reversal may be wrong by
 BLOCK_S = 0.5  # the floor is the median of such blocks: an event does not raise it
 
 
@@ -102,10 +102,16 @@ def standing(motion: Motion, low: Lowpass, peak: Array) -> NDArray[np.bool_]:
 
 
 def reversal(motion: Motion, low: Lowpass, soft: Array) -> Array:
-    """Share of Coulomb friction by which a sign that changes more sharply or softly differs, shape (N, J)."""
-    tanh = np.tanh
-    difference = np.abs(low(tanh(motion.qd / (0.5 * soft)) - tanh(motion.qd / (2 * soft))))
-    return np.asarray(ndimage.maximum_filter1d(difference, 3, axis=0))
+    """Share of Coulomb friction by which a reversal that is `EARLY_S` earlier or later differs, shape (N, J).
+
+    A real joint sticks for some milliseconds when it turns, which no model without a state predicts.
+    """
+    shift = max(1, round(EARLY_S / motion.dt_s))
+    sign = np.tanh(motion.qd / soft)
+    ahead, behind = np.roll(sign, -shift, axis=0), np.roll(sign, shift, axis=0)
+    if not motion.circular:
+        ahead[-shift:], behind[:shift] = sign[-1], sign[0]
+    return np.asarray(ndimage.maximum_filter1d(low(np.abs(ahead - behind) / 2), 3, axis=0))
 
 
 def repeat_noise(motion: Motion, low: Lowpass, inertia: Array) -> Array | None:
