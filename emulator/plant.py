@@ -41,6 +41,7 @@ class Plant:
         start_rad: Floats | None = None,
         substep_Hz: float = 10_000.0,
         ambient_C: float = AMBIENT_C,
+        extended: bool = False,
     ) -> None:
         """At rest at `start_rad`, by default the joint zero or the limit next to it.
 
@@ -49,6 +50,7 @@ class Plant:
             current_noise_A: Standard deviation of a period's mean current, shape (J,).
             encoder_noise_rad: Standard deviation of an encoder reading on the joint side, shape (J,).
             substep_Hz: At least this many substeps per second.
+            extended: Use the extended physics even where no effect needs it.
 
         Raises:
             ConfigError: An effect that this arm cannot have.
@@ -74,10 +76,10 @@ class Plant:
         self._state = _at_rest(q, self._body, ambient_C)
         self.motor_temperature_C = self._state.temperature_C
         self._extended: tuple[Physics, Memory] | None = None
-        if present.is_dynamic:
-            extended = physics(present, self._body, period_s, self._substeps, q)
-            self._state, memory = initial(extended, self._power, q, self._substeps, ambient_C)
-            self._extended = extended, memory
+        if present.is_dynamic or extended:
+            constants = physics(present, self._body, period_s, self._substeps, q)
+            self._state, memory = initial(constants, self._power, q, self._substeps, ambient_C)
+            self._extended = constants, memory
             self.motor_temperature_C = memory.warm.shown_C
         self.q, self.qd = self._state.q, self._state.qd
         self._state.counts[:] = robot.motor_counts(q)
@@ -107,6 +109,10 @@ class Plant:
     def set_current_limit(self, j: int, limit_A: float) -> None:
         """Saturation of the current loop's reference on axis j, in every mode."""
         self._power.max_A[j] = limit_A
+
+    def compiled(self) -> tuple[Physics, Power, State, Memory] | None:
+        """What the compiled physics works on, for loops that leave Python; None where it is not extended."""
+        return None if self._extended is None else (self._extended[0], self._power, self._state, self._extended[1])
 
     def warm_to(self, temperature_C: Floats) -> None:
         """Windings, lubricants and sensors of all axes as after long work, shape (J,)."""
