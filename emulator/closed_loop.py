@@ -13,12 +13,15 @@ from emulator.law import Aim, Law, Path, command, integrate_error, look_ahead
 
 DONE, NOT_POSITIVE, LOST = 0, 1, 2
 STANDING = 1e-9  # rad/s; what a joint at rest has left after `friction.rub`, reported as 0 so that its sign is 0
+_NODE = (0.0, 0.5, 0.5, 1.0)  # of the step, at which the stages of the fourth-order method stand
+_SHARE = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 _RUNAWAY = 1e4  # rad/s, a thousand times what an arm can do
 
 
 @compiled
 def _sampled(
     law: Law,
+    model: Terms | None,
     chain: Chain,
     aim: Aim,
     q: Floats,
@@ -51,7 +54,7 @@ def _sampled(
             speed[j] = (seen[law.delay, j] - seen[law.delay + 1, j]) / period
         else:
             speed[j] = seen_speed[law.delay, j]
-    command(law, chain, aim, seen[law.delay], speed, sum_, work, tau)
+    command(law, model, chain, aim, seen[law.delay], speed, sum_, work, tau)
 
 
 @compiled
@@ -67,8 +70,22 @@ def _remember(law: Law, q: Floats, qd: Floats, period: float) -> tuple[Floats, F
 
 
 @compiled
-def _is_lost(q: Floats, qd: Floats) -> bool:
-    return not (np.isfinite(q).all() and (np.abs(qd) < _RUNAWAY).all())
+def _why(q: Floats, qd: Floats, otherwise: int) -> int:
+    """LOST where the arm has run away, which shows in the mass matrix too."""
+    for j in range(len(q)):
+        if not (np.isfinite(q[j]) and abs(qd[j]) < _RUNAWAY):
+            return LOST
+    return otherwise
+
+
+@compiled
+def _record(q: Floats, qd: Floats, qdd: Floats, tau: Floats, out: Floats) -> None:
+    """Fills out, shape (4, J), with one sample."""
+    for j in range(len(q)):
+        out[0, j] = q[j]
+        out[1, j] = qd[j] if abs(qd[j]) > STANDING else 0.0
+        out[2, j] = qdd[j]
+        out[3, j] = tau[j]
 
 
 @compiled
@@ -77,6 +94,7 @@ def runge_kutta(
     terms: Terms,
     steepness: Floats,
     law: Law,
+    model: Terms | None,
     path: Path,
     start: Floats,
     substeps: int,
@@ -85,6 +103,7 @@ def runge_kutta(
     """Fourth-order Runge-Kutta with dry friction dry * tanh(steepness * speed).
 
     Args:
+        model: Of computed torque.
         path: Reference on the sample grid.
         start: Position and speed of the first sample, shape (2, J).
         substeps: Integration steps per sample.
@@ -97,38 +116,41 @@ def runge_kutta(
     h = path.step / substeps
     work, aim = workspace(J), Aim(np.empty(J), np.empty(J), np.empty(J))
     q, v, z, tau = start[0].copy(), start[1].copy(), np.zeros(J), np.zeros(J)
-    at_q, at_v, at_z = np.empty(J), np.empty(J), np.empty(J)
-    slope_q, slope_v, slope_z = np.zeros((4, J)), np.zeros((4, J)), np.zeros((4, J))
+    at_q, at_v, at_z, acceleration, error = np.empty(J), np.empty(J), np.empty(J), np.empty(J), np.zeros(J)
+    next_q, next_v, next_z = np.empty(J), np.empty(J), np.empty(J)
     seen, seen_speed = _remember(law, q, v, law.hold * h)
-    node = (0.0, 0.5, 0.5, 1.0)
+    look_ahead(path, 0, 0.0, aim)
     for n in range(T):
         for s in range(substeps):
             if law.hold and (n * substeps + s) % law.hold == 0:
                 look_ahead(path, n, s / substeps, aim)
-                _sampled(law, chain, aim, q, v, seen, seen_speed, z, law.hold * h, work, at_v, tau)
-            for stage in range(4):
-                c = node[stage] * h
-                for j in range(J):
-                    at_q[j] = q[j] + c * slope_q[stage - 1, j]
-                    at_v[j] = v[j] + c * slope_v[stage - 1, j]
-                    at_z[j] = z[j] + c * slope_z[stage - 1, j]
-                if not law.hold:
-                    look_ahead(path, n, (s + node[stage]) / substeps, aim)
-                    integrate_error(law, aim, at_q, slope_z[stage])
-                    command(law, chain, aim, at_q, at_v, at_z, work, tau)
-                slope_q[stage, :] = at_v
-                if not smooth_acceleration(chain, terms, steepness, at_q, at_v, tau, work, slope_v[stage]):
-                    return (LOST if _is_lost(at_q, at_v) else NOT_POSITIVE), n
-                if stage == 0 and s == 0:
-                    if _is_lost(q, v):
-                        return LOST, n
-                    out[0, n, :], out[1, n, :], out[2, n, :], out[3, n, :] = q, v, slope_v[0], tau
-                    if n == T - 1:
-                        return DONE, n
+                _sampled(law, model, chain, aim, q, v, seen, seen_speed, z, law.hold * h, work, at_v, tau)
             for j in range(J):
-                q[j] += h / 6 * (slope_q[0, j] + 2 * slope_q[1, j] + 2 * slope_q[2, j] + slope_q[3, j])
-                v[j] += h / 6 * (slope_v[0, j] + 2 * slope_v[1, j] + 2 * slope_v[2, j] + slope_v[3, j])
-                z[j] += h / 6 * (slope_z[0, j] + 2 * slope_z[1, j] + 2 * slope_z[2, j] + slope_z[3, j])
+                at_q[j], at_v[j], at_z[j] = q[j], v[j], z[j]
+                next_q[j], next_v[j], next_z[j] = q[j], v[j], z[j]
+            for stage in range(4):
+                if not law.hold:
+                    if stage in (1, 3):  # the others are at the time of the one before
+                        look_ahead(path, n, (s + _NODE[stage]) / substeps, aim)
+                    command(law, model, chain, aim, at_q, at_v, at_z, work, tau)
+                    integrate_error(law, aim, at_q, error)
+                if not smooth_acceleration(chain, terms, steepness, at_q, at_v, tau, work, acceleration):
+                    return _why(at_q, at_v, NOT_POSITIVE), n
+                if stage == 0 and s == 0:
+                    _record(q, v, acceleration, tau, out[:, n])
+                    why = _why(q, v, DONE)
+                    if why != DONE or n == T - 1:
+                        return why, n
+                share, ahead = h * _SHARE[stage], h * _NODE[(stage + 1) % 4]
+                for j in range(J):
+                    next_q[j] += share * at_v[j]
+                    next_v[j] += share * acceleration[j]
+                    next_z[j] += share * error[j]
+                    at_q[j] = q[j] + ahead * at_v[j]
+                    at_v[j] = v[j] + ahead * acceleration[j]
+                    at_z[j] = z[j] + ahead * error[j]
+            for j in range(J):
+                q[j], v[j], z[j] = next_q[j], next_v[j], next_z[j]
     return DONE, T - 1
 
 
@@ -167,20 +189,11 @@ def _viscous_at_both_ends(terms: Terms, h: float, qd: Floats, speed: Floats, wor
 
 
 @compiled
-def _report(q: Floats, v: Floats, next_v: Floats, h: float, tau: Floats, out: Floats) -> None:
-    """Fills out, shape (4, J), with q, qd, qdd, tau of one sample."""
-    for j in range(len(q)):
-        out[0, j] = q[j]
-        out[1, j] = v[j] if abs(v[j]) > STANDING else 0.0
-        out[2, j] = (next_v[j] - v[j]) / h
-        out[3, j] = tau[j]
-
-
-@compiled
 def leapfrog(
     chain: Chain,
     terms: Terms,
     law: Law,
+    model: Terms | None,
     path: Path,
     start: Floats,
     substeps: int,
@@ -204,18 +217,20 @@ def leapfrog(
         for s in range(substeps):
             if law.hold and (n * substeps + s) % law.hold == 0:
                 look_ahead(path, n, s / substeps, aim)
-                _sampled(law, chain, aim, q, v, seen, seen_speed, z, law.hold * h, work, speed, tau)
+                _sampled(law, model, chain, aim, q, v, seen, seen_speed, z, law.hold * h, work, speed, tau)
             if s == 0:
                 if not law.hold:
                     look_ahead(path, n, 0.0, aim)
-                    command(law, chain, aim, q, v, z, work, tau)
+                    command(law, model, chain, aim, q, v, z, work, tau)
                 probe[:] = impulse
                 evaluate(chain, terms, q, v, work)
                 if not _rubbed(terms, h, tau, v, work, probe, X, bound, next_v):
-                    return (LOST if _is_lost(q, v) else NOT_POSITIVE), n
-                _report(q, v, next_v, h, tau, out[:, n])
-                if n == T - 1:
-                    return DONE, n
+                    return _why(q, v, NOT_POSITIVE), n
+                rate[:] = (next_v - v) / h
+                _record(q, v, rate, tau, out[:, n])
+                why = _why(q, v, DONE)
+                if why != DONE or n == T - 1:
+                    return why, n
             for j in range(J):
                 middle[j] = q[j] + h / 2 * v[j]
                 speed[j] = v[j] + h / 2 * mean[j]
@@ -225,11 +240,11 @@ def leapfrog(
                 for j in range(J):
                     sum_[j] = z[j] + h / 2 * rate[j]
                     z[j] += h * rate[j]
-                command(law, chain, aim, middle, speed, sum_, work, tau)
+                command(law, model, chain, aim, middle, speed, sum_, work, tau)
             evaluate(chain, terms, middle, speed, work)
             _viscous_at_both_ends(terms, h, v, speed, work)
             if not _rubbed(terms, h, tau, v, work, impulse, X, bound, next_v):
-                return (LOST if _is_lost(q, v) else NOT_POSITIVE), n
+                return _why(q, v, NOT_POSITIVE), n
             for j in range(J):
                 mean[j] = (next_v[j] - v[j]) / h
                 v[j] = next_v[j]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emulator.dynamics import Dynamics, freeze, nothing
+from emulator.dynamics import Dynamics, freeze
 from emulator.law import Law
 from protocols.errors import ConfigError
 
@@ -110,13 +110,12 @@ class Control:
         """
         return Law(
             self.axes,
+            int(not np.array_equal(self.axes, np.eye(len(self.axes)))),
             self.stiffness,
             self.damping,
             self.integral,
             self.speed_weight,
             self.limit_Nm,
-            (self.model or nothing(len(self.stiffness))).terms(),
-            int(self.model is not None),
             hold,
             self.delay,
             int(self.difference),

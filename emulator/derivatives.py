@@ -14,23 +14,23 @@ from typing import NamedTuple
 import numpy as np
 
 from emulator.forward import Chain
-from emulator.kernels import Floats, compiled, place
+from emulator.kernels import Floats, Vector, compiled, place
 
 _XX, _XY, _XZ, _YY, _YZ, _ZZ = 4, 5, 6, 7, 8, 9  # columns of a row of inertial parameters
+Spatial = tuple[Vector, Vector]  # motions and wrenches: angular part or moment first, about the base origin
 
 
 class Bodies(NamedTuple):
     """Scratch, one row per joint: its screw and rates, and its link together with all links after it.
 
-    Vectors of six hold the angular part first; the linear part is that at the base origin.
-
     Attributes:
-        S: Screw of the joint.
+        R, p: Placement in the frame before.
+        S: Screw of the joint, shape (J, 6).
         dS: Its rate by the speed of the link before it.
-        ddS: Its rate by that link's acceleration, and of dS by its speed.
+        ddS: Its rate by that link's acceleration, and that of dS by its speed.
         inertia: The ten parameters in the base frame.
-        momentum, G: P and G of the module, shape (J, 3) and (J, 3, 3).
-        force: Moment about the base origin, and force.
+        flow: G of the module row by row, then P, shape (J, 12).
+        force: Wrench that moves the links.
     """
 
     R: Floats
@@ -39,8 +39,7 @@ class Bodies(NamedTuple):
     dS: Floats
     ddS: Floats
     inertia: Floats
-    momentum: Floats
-    G: Floats
+    flow: Floats
     force: Floats
 
 
@@ -53,134 +52,170 @@ def bodies(J: int) -> Bodies:
         np.empty((J, 6)),
         np.empty((J, 6)),
         np.empty((J, 10)),
-        np.empty((J, 3)),
-        np.empty((J, 3, 3)),
+        np.empty((J, 12)),
         np.empty((J, 6)),
     )
 
 
 @compiled
-def _add_cross(a: Floats, b: Floats, out: Floats) -> None:
-    """out += a x b."""
-    out[0] += a[1] * b[2] - a[2] * b[1]
-    out[1] += a[2] * b[0] - a[0] * b[2]
-    out[2] += a[0] * b[1] - a[1] * b[0]
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @compiled
-def _add_motion_cross(v: Floats, m: Floats, out: Floats) -> None:
-    """out += v x m, the rate of a screw m that moves with v."""
-    _add_cross(v[:3], m[:3], out[:3])
-    _add_cross(v[:3], m[3:], out[3:])
-    _add_cross(v[3:], m[:3], out[3:])
+def _sum(a: Vector, b: Vector) -> Vector:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @compiled
-def _add_force_cross(v: Floats, f: Floats, out: Floats) -> None:
-    """out += v x* f, the rate of a wrench f that moves with v."""
-    _add_cross(v[:3], f[:3], out[:3])
-    _add_cross(v[3:], f[3:], out[:3])
-    _add_cross(v[:3], f[3:], out[3:])
+def _times(k: float, a: Vector) -> Vector:
+    return k * a[0], k * a[1], k * a[2]
 
 
 @compiled
-def _add_inertia_times(body: Floats, m: Floats, out: Floats) -> None:
-    """out += I m, the wrench of a motion m."""
-    out[0] += body[_XX] * m[0] + body[_XY] * m[1] + body[_XZ] * m[2]
-    out[1] += body[_XY] * m[0] + body[_YY] * m[1] + body[_YZ] * m[2]
-    out[2] += body[_XZ] * m[0] + body[_YZ] * m[1] + body[_ZZ] * m[2]
-    _add_cross(body[1:4], m[3:], out[:3])
-    _add_cross(m[:3], body[1:4], out[3:])
-    for i in range(3):
-        out[3 + i] += body[0] * m[3 + i]
+def _dot(a: Spatial, x: Floats, j: int) -> float:
+    """Power of a wrench on the motion in row j, or the like."""
+    n, f = a
+    turning: float = n[0] * x[j, 0] + n[1] * x[j, 1] + n[2] * x[j, 2]
+    moving: float = f[0] * x[j, 3] + f[1] * x[j, 4] + f[2] * x[j, 5]
+    return turning + moving
 
 
 @compiled
-def _to_base(link: Floats, R: Floats, p: Floats, out: Floats) -> None:
-    """Ten parameters of a link whose frame lies at (R, p), in the base frame."""
-    m = link[0]
-    out[0] = m
-    mc = np.empty(3)
-    for a in range(3):
-        mc[a] = R[a, 0] * link[1] + R[a, 1] * link[2] + R[a, 2] * link[3]
-        out[1 + a] = mc[a] + m * p[a]
+def _at(x: Floats, j: int) -> Spatial:
+    return (x[j, 0], x[j, 1], x[j, 2]), (x[j, 3], x[j, 4], x[j, 5])
+
+
+@compiled
+def _put(x: Floats, j: int, a: Spatial) -> None:
+    (x[j, 0], x[j, 1], x[j, 2]), (x[j, 3], x[j, 4], x[j, 5]) = a
+
+
+@compiled
+def _both(a: Spatial, b: Spatial) -> Spatial:
+    return _sum(a[0], b[0]), _sum(a[1], b[1])
+
+
+@compiled
+def _turn_motion(v: Spatial, m: Spatial) -> Spatial:
+    """v x m: rate of a motion m that is carried by v."""
+    return _cross(v[0], m[0]), _sum(_cross(v[0], m[1]), _cross(v[1], m[0]))
+
+
+@compiled
+def _turn_wrench(v: Spatial, f: Spatial) -> Spatial:
+    """v x* f: rate of a wrench f that is carried by v."""
+    return _sum(_cross(v[0], f[0]), _cross(v[1], f[1])), _cross(v[0], f[1])
+
+
+@compiled
+def _inertia_times(body: Floats, j: int, m: Spatial) -> Spatial:
+    """Wrench of a motion m of the bodies in row j."""
+    w, u = m
+    h = (body[j, 1], body[j, 2], body[j, 3])
+    turning = (
+        body[j, _XX] * w[0] + body[j, _XY] * w[1] + body[j, _XZ] * w[2],
+        body[j, _XY] * w[0] + body[j, _YY] * w[1] + body[j, _YZ] * w[2],
+        body[j, _XZ] * w[0] + body[j, _YZ] * w[1] + body[j, _ZZ] * w[2],
+    )
+    return _sum(turning, _cross(h, u)), _sum(_times(body[j, 0], u), _cross(w, h))
+
+
+@compiled
+def _coriolis_times(flow: Floats, j: int, a: Vector) -> Spatial:
+    """2 B (a, .) of the module."""
+    G, trace = flow, flow[j, 0] + flow[j, 4] + flow[j, 8]
+    turned = (
+        trace * a[0] - G[j, 0] * a[0] - G[j, 1] * a[1] - G[j, 2] * a[2],
+        trace * a[1] - G[j, 3] * a[0] - G[j, 4] * a[1] - G[j, 5] * a[2],
+        trace * a[2] - G[j, 6] * a[0] - G[j, 7] * a[1] - G[j, 8] * a[2],
+    )
+    return _times(2.0, turned), _cross(a, (2.0 * flow[j, 9], 2.0 * flow[j, 10], 2.0 * flow[j, 11]))
+
+
+@compiled
+def _times_coriolis(flow: Floats, j: int, S: Spatial) -> Spatial:
+    """2 B' S; its linear part is zero."""
+    G, trace, a = flow, flow[j, 0] + flow[j, 4] + flow[j, 8], S[0]
+    turned = (
+        trace * a[0] - G[j, 0] * a[0] - G[j, 3] * a[1] - G[j, 6] * a[2],
+        trace * a[1] - G[j, 1] * a[0] - G[j, 4] * a[1] - G[j, 7] * a[2],
+        trace * a[2] - G[j, 2] * a[0] - G[j, 5] * a[1] - G[j, 8] * a[2],
+    )
+    left = _sum(turned, _cross((flow[j, 9], flow[j, 10], flow[j, 11]), S[1]))
+    return _times(2.0, left), (0.0, 0.0, 0.0)
+
+
+@compiled
+def _to_base(link: Floats, j: int, R: Floats, p: Floats, out: Floats) -> None:
+    """Ten parameters of link j, whose frame lies at (R, p), in the base frame; as `kernels._attach`."""
+    m = link[j, 0]
+    mc = (
+        R[0, 0] * link[j, 1] + R[0, 1] * link[j, 2] + R[0, 2] * link[j, 3],
+        R[1, 0] * link[j, 1] + R[1, 1] * link[j, 2] + R[1, 2] * link[j, 3],
+        R[2, 0] * link[j, 1] + R[2, 1] * link[j, 2] + R[2, 2] * link[j, 3],
+    )
     dot = 0.0
+    out[j, 0] = m
     for a in range(3):
+        out[j, 1 + a] = mc[a] + m * p[a]
         dot += p[a] * (2.0 * mc[a] + m * p[a])
     column = _XX
     for a in range(3):
-        x = R[a, 0] * link[_XX] + R[a, 1] * link[_XY] + R[a, 2] * link[_XZ]
-        y = R[a, 0] * link[_XY] + R[a, 1] * link[_YY] + R[a, 2] * link[_YZ]
-        z = R[a, 0] * link[_XZ] + R[a, 1] * link[_YZ] + R[a, 2] * link[_ZZ]
+        x = R[a, 0] * link[j, _XX] + R[a, 1] * link[j, _XY] + R[a, 2] * link[j, _XZ]
+        y = R[a, 0] * link[j, _XY] + R[a, 1] * link[j, _YY] + R[a, 2] * link[j, _YZ]
+        z = R[a, 0] * link[j, _XZ] + R[a, 1] * link[j, _YZ] + R[a, 2] * link[j, _ZZ]
         for b in range(a, 3):
-            out[column] = x * R[b, 0] + y * R[b, 1] + z * R[b, 2] - p[a] * mc[b] - mc[a] * p[b] - m * p[a] * p[b]
-            if a == b:
-                out[column] += dot
+            value = x * R[b, 0] + y * R[b, 1] + z * R[b, 2] - p[a] * mc[b] - mc[a] * p[b] - m * p[a] * p[b]
+            out[j, column] = value + (dot if a == b else 0.0)
             column += 1
 
 
 @compiled
-def _flow(body: Floats, v: Floats, momentum: Floats, G: Floats) -> None:
-    """Fills P and G of a body in the base frame that moves with v."""
-    w, h = v[:3], body[1:4]
-    for i in range(3):
-        momentum[i] = body[0] * v[3 + i]
-    _add_cross(w, h, momentum)
-    half = (body[_XX] + body[_YY] + body[_ZZ]) / 2
-    second = np.empty(3)  # a column of the integral of rho r r'
+def _set_flow(body: Floats, j: int, v: Spatial, flow: Floats) -> None:
+    """Fills G = u h' + [w] (integral of rho r r') and P = m u + w x h of the body in row j that moves with v."""
+    w, u = v
+    h = (body[j, 1], body[j, 2], body[j, 3])
+    half = (body[j, _XX] + body[j, _YY] + body[j, _ZZ]) / 2
+    columns = (
+        (half - body[j, _XX], -body[j, _XY], -body[j, _XZ]),
+        (-body[j, _XY], half - body[j, _YY], -body[j, _YZ]),
+        (-body[j, _XZ], -body[j, _YZ], half - body[j, _ZZ]),
+    )
     for b in range(3):
-        for a in range(3):
-            low, high = min(a, b), max(a, b)
-            second[a] = -body[_XX + low * (5 - low) // 2 + high]
-            G[a, b] = v[3 + a] * h[b]
-        second[b] += half
-        _add_cross(w, second, G[:, b])
+        flow[j, b], flow[j, 3 + b], flow[j, 6 + b] = _sum(_times(h[b], u), _cross(w, columns[b]))
+    flow[j, 9], flow[j, 10], flow[j, 11] = _sum(_times(body[j, 0], u), _cross(w, h))
 
 
 @compiled
 def _outward(chain: Chain, link: Floats, q: Floats, qd: Floats, qdd: Floats, x: Bodies) -> None:
     """Screws, motions and single bodies from the base to the tool."""
-    J = len(q)
     place(chain.R0, chain.p0, chain.prismatic, q, x.R, x.p)
-    v, a, Iv = np.zeros(6), np.zeros(6), np.empty(6)
+    nought = (0.0, 0.0, 0.0)
+    v = (nought, nought)
+    acceleration = (nought, (-chain.gravity[0], -chain.gravity[1], -chain.gravity[2]))
     R, p, frame = np.eye(3), np.zeros(3), np.empty((3, 3))
-    a[3:] = -chain.gravity
-    for j in range(J):
+    for j in range(len(q)):
         for r in range(3):
+            p[r] += R[r, 0] * x.p[j, 0] + R[r, 1] * x.p[j, 1] + R[r, 2] * x.p[j, 2]
             for c in range(3):
                 frame[r, c] = R[r, 0] * x.R[j, 0, c] + R[r, 1] * x.R[j, 1, c] + R[r, 2] * x.R[j, 2, c]
-            p[r] += R[r, 0] * x.p[j, 0] + R[r, 1] * x.p[j, 1] + R[r, 2] * x.p[j, 2]
-        R[:, :] = frame
-        S, dS, ddS = x.S[j], x.dS[j], x.ddS[j]
-        S[:] = 0.0
-        dS[:] = 0.0
-        ddS[:] = 0.0
-        if chain.prismatic[j]:
-            S[3:] = R[:, 2]
-        else:
-            S[:3] = R[:, 2]
-            _add_cross(p, S[:3], S[3:])
-        _add_motion_cross(v, S, dS)
-        _add_motion_cross(a, S, ddS)
-        _add_motion_cross(v, dS, ddS)
-        for i in range(6):
-            v[i] += S[i] * qd[j]
-            a[i] += S[i] * qdd[j] + dS[i] * qd[j]
-        _to_base(link[j], R, p, x.inertia[j])
-        _flow(x.inertia[j], v, x.momentum[j], x.G[j])
-        Iv[:] = 0.0
-        _add_inertia_times(x.inertia[j], v, Iv)
-        x.force[j, :] = 0.0
-        _add_inertia_times(x.inertia[j], a, x.force[j])
-        _add_force_cross(v, Iv, x.force[j])
-
-
-@compiled
-def _dot(a: Floats, b: Floats) -> float:
-    value = 0.0
-    for i in range(len(a)):
-        value += a[i] * b[i]
-    return value
+        R, frame = frame, R
+        axis = (R[0, 2], R[1, 2], R[2, 2])
+        S = (nought, axis) if chain.prismatic[j] else (axis, _cross((p[0], p[1], p[2]), axis))
+        dS = _turn_motion(v, S)
+        _put(x.S, j, S)
+        _put(x.dS, j, dS)
+        _put(x.ddS, j, _both(_turn_motion(acceleration, S), _turn_motion(v, dS)))
+        v = _sum(v[0], _times(qd[j], S[0])), _sum(v[1], _times(qd[j], S[1]))
+        acceleration = (
+            _sum(acceleration[0], _sum(_times(qdd[j], S[0]), _times(qd[j], dS[0]))),
+            _sum(acceleration[1], _sum(_times(qdd[j], S[1]), _times(qd[j], dS[1]))),
+        )
+        _to_base(link, j, R, p, x.inertia)
+        _set_flow(x.inertia, j, v, x.flow)
+        force = _inertia_times(x.inertia, j, acceleration)
+        _put(x.force, j, _both(force, _turn_wrench(v, _inertia_times(x.inertia, j, v))))
 
 
 @compiled
@@ -192,43 +227,25 @@ def inverse_dynamics_derivatives(
     Args:
         x: Scratch.
     """
-    J = len(q)
     _outward(chain, link, q, qd, qdd, x)
-    IS, left, forward, rate = np.empty(6), np.empty(3), np.empty(6), np.empty(6)
-    for i in range(J - 1, -1, -1):
-        S, dS, G = x.S[i], x.dS[i], x.G[i]
-        trace = G[0, 0] + G[1, 1] + G[2, 2]
-        IS[:] = 0.0
-        _add_inertia_times(x.inertia[i], S, IS)
-        left[:] = 0.0  # angular part of 2 B' S; the linear part is zero
-        _add_cross(x.momentum[i], S[3:], left)
-        forward[:] = 0.0  # torque on earlier joints by q_i
-        rate[:] = 0.0  # and by qd_i
-        _add_inertia_times(x.inertia[i], x.ddS[i], forward)
-        _add_force_cross(S, x.force[i], forward)
-        _add_inertia_times(x.inertia[i], dS, rate)
-        for a in range(3):
-            turned, by, spun = 0.0, 0.0, 0.0
-            for b in range(3):
-                turned += G[b, a] * S[b]
-                by += G[a, b] * dS[b]
-                spun += G[a, b] * S[b]
-            left[a] = 2.0 * (left[a] + trace * S[a] - turned)
-            forward[a] += 2.0 * (trace * dS[a] - by)
-            rate[a] = 2.0 * (rate[a] + trace * S[a] - spun)
-            rate[3 + a] = 2.0 * rate[3 + a]
-        twice = 2.0 * x.momentum[i]
-        _add_cross(dS[:3], twice, forward[3:])
-        _add_cross(S[:3], twice, rate[3:])
+    for i in range(len(q) - 1, -1, -1):
+        S, dS = _at(x.S, i), _at(x.dS, i)
+        IS, left = _inertia_times(x.inertia, i, S), _times_coriolis(x.flow, i, S)
+        turned = _both(_coriolis_times(x.flow, i, dS[0]), _turn_wrench(S, _at(x.force, i)))
+        forward = _both(_inertia_times(x.inertia, i, _at(x.ddS, i)), turned)  # on joints before i, by q_i
+        I_dS = _inertia_times(x.inertia, i, dS)
+        rate = _both(_coriolis_times(x.flow, i, S[0]), _both(I_dS, I_dS))  # and by qd_i
         for j in range(i + 1):
-            M[i, j] = _dot(IS, x.S[j])
+            M[i, j] = _dot(IS, x.S, j)
             M[j, i] = M[i, j]
-            by_q[j, i] = _dot(forward, x.S[j])
-            by_qd[j, i] = _dot(rate, x.S[j])
-            by_q[i, j] = _dot(left, x.dS[j, :3]) + _dot(IS, x.ddS[j])
-            by_qd[i, j] = _dot(left, x.S[j, :3]) + 2.0 * _dot(IS, x.dS[j])
+            by_q[j, i] = _dot(forward, x.S, j)
+            by_qd[j, i] = _dot(rate, x.S, j)
+            by_q[i, j] = _dot(left, x.dS, j) + _dot(IS, x.ddS, j)
+            by_qd[i, j] = _dot(left, x.S, j) + 2.0 * _dot(IS, x.dS, j)
         if i > 0:
-            x.inertia[i - 1] += x.inertia[i]
-            x.momentum[i - 1] += x.momentum[i]
-            x.G[i - 1] += G
-            x.force[i - 1] += x.force[i]
+            for c in range(10):
+                x.inertia[i - 1, c] += x.inertia[i, c]
+            for c in range(12):
+                x.flow[i - 1, c] += x.flow[i, c]
+            for c in range(6):
+                x.force[i - 1, c] += x.force[i, c]

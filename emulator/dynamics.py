@@ -106,9 +106,3 @@ class Dynamics:
     def terms(self) -> Terms:
         """Arguments of the kernels."""
         return Terms(self.link, self.rotor, self.viscous, self.offset_Nm, self.dry_rows, self.dry_Nm, self.skew_Nms_rad)
-
-
-def nothing(J: int) -> Dynamics:
-    """An arm without inertia and friction."""
-    square, empty = np.zeros((J, J)), np.zeros(0)
-    return Dynamics(np.zeros((J, 10)), square, square, np.zeros(J), np.zeros((0, J)), empty, empty)

@@ -73,19 +73,28 @@ def row_speed(rows: Floats, k: int, qd: Floats) -> float:
 def evaluate(chain: Chain, terms: Terms, q: Floats, qd: Floats, work: Work) -> None:
     """Fills work.M with M(q) and work.load with N(q, qd)."""
     J = len(q)
-    place(chain.R0, chain.p0, chain.prismatic, q, work.R, work.p)
-    newton_euler(work.R, work.p, chain.prismatic, chain.gravity, terms.link, qd, work.rest, work.load, work.f, work.n)
-    composite_inertia(work.R, work.p, chain.prismatic, terms.link, work.M, work.whole)
+    R, p, M, load = work.R, work.p, work.M, work.load  # taken out once: each access of a tuple costs
+    link, rotor, viscous, offset, rows, skew = (
+        terms.link,
+        terms.rotor,
+        terms.viscous,
+        terms.offset,
+        terms.rows,
+        terms.skew,
+    )
+    place(chain.R0, chain.p0, chain.prismatic, q, R, p)
+    newton_euler(R, p, chain.prismatic, chain.gravity, link, qd, work.rest, load, work.f, work.n)
+    composite_inertia(R, p, chain.prismatic, link, M, work.whole)
     for j in range(J):
-        work.load[j] += terms.offset[j]
+        load[j] += offset[j]
         for i in range(J):
-            work.M[j, i] += terms.rotor[j, i]
-            work.load[j] += terms.viscous[j, i] * qd[i]
-    for k in range(len(terms.skew)):
-        if terms.skew[k] != 0.0:
-            size = terms.skew[k] * abs(row_speed(terms.rows, k, qd))
+            M[j, i] += rotor[j, i]
+            load[j] += viscous[j, i] * qd[i]
+    for k in range(len(skew)):
+        if skew[k] != 0.0:
+            size = skew[k] * abs(row_speed(rows, k, qd))
             for j in range(J):
-                work.load[j] += terms.rows[k, j] * size
+                load[j] += rows[k, j] * size
 
 
 @compiled

@@ -11,21 +11,22 @@ from emulator.kernels import Floats, compiled, newton_euler, place
 class Law(NamedTuple):
     """Arrays of `emulator.simulator.Control`.
 
+    The model of computed torque is handed around beside it: None there makes compiled code without that branch.
+
     Attributes:
-        inverse: 1 for computed torque: gains then make an acceleration, and `model` the torque.
+        turned: 1 where `axes` are not the joints.
         hold: Integration steps for which a torque is held; 0 for a law in continuous time.
         delay: Age of the positions that a torque is computed from, in periods.
         difference: 1 where speed is the difference of two positions over one period.
     """
 
     axes: Floats
+    turned: int
     stiffness: Floats
     damping: Floats
     integral: Floats
     speed_weight: Floats
     limit: Floats
-    model: Terms
-    inverse: int
     hold: int
     delay: int
     difference: int
@@ -69,48 +70,67 @@ def look_ahead(path: Path, n: int, x: float, aim: Aim) -> None:
 @compiled
 def integrate_error(law: Law, aim: Aim, q: Floats, rate: Floats) -> None:
     """Fills rate with the position errors on the axes of the law, shape (J,)."""
-    for a in range(len(q)):
+    J = len(q)
+    for a in range(J):
+        if not law.turned:
+            rate[a] = aim.q[a] - q[a]
+            continue
         rate[a] = 0.0
-        for j in range(len(q)):
+        for j in range(J):
             rate[a] += law.axes[a, j] * (aim.q[j] - q[j])
 
 
 @compiled
-def command(law: Law, chain: Chain, aim: Aim, q: Floats, qd: Floats, sum_: Floats, work: Work, tau: Floats) -> None:
+def command(
+    law: Law,
+    model: Terms | None,
+    chain: Chain,
+    aim: Aim,
+    q: Floats,
+    qd: Floats,
+    sum_: Floats,
+    work: Work,
+    tau: Floats,
+) -> None:
     """Fills tau with the joint torques.
 
     Args:
+        model: For computed torque: gains then make an acceleration, and the model the torque.
         sum_: Integral of the position errors, shape (J,).
     """
     J = len(q)
-    u = work.load  # free until the dynamics are evaluated
+    axes, stiffness, damping, integral = law.axes, law.stiffness, law.damping, law.integral
+    weight, limit, turned = law.speed_weight, law.limit, law.turned  # taken out once: each access of a tuple costs
+    aim_q, aim_qd, u = aim.q, aim.qd, work.load  # load is free until the dynamics are evaluated
     for a in range(J):
-        u[a] = law.integral[a] * sum_[a]
-        for j in range(J):
-            u[a] += law.axes[a, j] * (
-                law.stiffness[a] * (aim.q[j] - q[j]) + law.damping[a] * (law.speed_weight[a] * aim.qd[j] - qd[j])
-            )
-    if law.inverse:
-        for j in range(J):
-            u[j] += aim.qdd[j]
-        _inverse_dynamics(law.model, chain, aim, q, qd, u, work, tau)
-        for j in range(J):
-            tau[j] = min(max(tau[j], -law.limit[j]), law.limit[j])
-        return
+        error, speed = aim_q[a] - q[a], weight[a] * aim_qd[a] - qd[a]
+        if turned:
+            error, speed = 0.0, 0.0
+            for j in range(J):
+                error += axes[a, j] * (aim_q[j] - q[j])
+                speed += axes[a, j] * (weight[a] * aim_qd[j] - qd[j])
+        u[a] = stiffness[a] * error + damping[a] * speed + integral[a] * sum_[a]
+    if model is not None:
+        _inverse_dynamics(model, chain, aim, q, qd, work, tau)
     for a in range(J):
-        u[a] = min(max(u[a], -law.limit[a]), law.limit[a])
+        u[a] = min(max(u[a], -limit[a]), limit[a])
     for j in range(J):
-        tau[j] = 0.0
-        for a in range(J):
-            tau[j] += law.axes[a, j] * u[a]
+        tau[j] = u[j]
+        if turned:
+            tau[j] = 0.0
+            for a in range(J):
+                tau[j] += axes[a, j] * u[a]
 
 
 @compiled
-def _inverse_dynamics(
-    model: Terms, chain: Chain, aim: Aim, q: Floats, qd: Floats, u: Floats, work: Work, tau: Floats
-) -> None:
-    """Torque that gives the model the acceleration u; dry friction is that of the reference, so it never chatters."""
-    J = len(q)
+def _inverse_dynamics(model: Terms, chain: Chain, aim: Aim, q: Floats, qd: Floats, work: Work, tau: Floats) -> None:
+    """Turns the acceleration in work.load into the model's torque; tau is scratch.
+
+    Dry friction is that of the reference, so it never chatters.
+    """
+    J, u = len(q), work.load
+    for j in range(J):
+        u[j] += aim.qdd[j]
     place(chain.R0, chain.p0, chain.prismatic, q, work.R, work.p)
     newton_euler(work.R, work.p, chain.prismatic, chain.gravity, model.link, qd, u, tau, work.f, work.n)
     for j in range(J):
@@ -122,3 +142,4 @@ def _inverse_dynamics(
         size = model.dry[k] * np.sign(speed) + model.skew[k] * abs(speed)
         for j in range(J):
             tau[j] += model.rows[k, j] * size
+    u[:] = tau

@@ -65,11 +65,12 @@ def sensitivities(simulation: Simulation, regressor: Array) -> Sensitivities:
         )
     place, control = simulation.geometry, simulation.control
     hold, lag_s = _sampling(simulation)
-    q, tau = np.empty((2, J, T, regressor.shape[2]))
+    q, tau = np.empty((J, T, regressor.shape[2])), np.empty((J, T, regressor.shape[2]))
     propagate(
         Chain(place.R0, place.p0, place.prismatic, place.gravity),
         simulation.dynamics.terms(),
         control.law(hold),
+        None if control.model is None else control.model.terms(),
         Loop(simulation.q, simulation.qd, simulation.qdd, _free(simulation), simulation.step_s, lag_s),
         simulation.steepness,
         np.ascontiguousarray(regressor, dtype=float),
@@ -99,5 +100,5 @@ def _free(simulation: Simulation) -> Array:
     if simulation.control.model is not None:
         command = simulation.tau_Nm
     else:
-        command = np.linalg.solve(simulation.control.axes.T, simulation.tau_Nm.T).T
+        command = np.asarray(np.linalg.solve(simulation.control.axes.T, simulation.tau_Nm.T).T, dtype=float)
     return np.asarray(np.abs(command) < limit * (1 - 1e-12), dtype=float)

@@ -99,6 +99,7 @@ def simulate(
     h_s = step_s / substeps
     limit = StepLimit.on(geometry, dynamics, control, reference.q, h_s)
     law = control.law(_hold(control.period_s, h_s))
+    model = None if control.model is None else control.model.terms()
     aim_q, aim_qd, aim_qdd = (np.ascontiguousarray(x, dtype=float) for x in (reference.q, reference.qd, reference.qdd))
     path = Path(aim_q, aim_qd, aim_qdd, step_s)
     first = np.array((reference.q[0], reference.qd[0]) if start is None else start, dtype=float)
@@ -107,11 +108,11 @@ def simulate(
     if isinstance(friction, Exact):
         limit.check_leapfrog()
         steepness = np.full(len(dynamics.dry_Nm), np.inf)
-        outcome, n = leapfrog(*arm, law, path, first, substeps, out)
+        outcome, n = leapfrog(*arm, law, model, path, first, substeps, out)
     else:
         k = friction.steepness_s_rad
         steepness = limit.steepest() if k is None else limit.check_steepness(k)
-        outcome, n = runge_kutta(*arm, steepness, law, path, first, substeps, out)
+        outcome, n = runge_kutta(*arm, steepness, law, model, path, first, substeps, out)
     if outcome != DONE:
         raise _failure(outcome, n * step_s, out[0, max(n - 1, 0)])
     q, qd, qdd, tau = out
