@@ -603,6 +603,39 @@ ENDPOINT = "tcp/127.0.0.1:7447"
 
 
 @app.command()
+def explain(
+    recordings: Recordings,
+    robot: RobotOption = None,
+    validate: ValidateOption = None,
+    json: JsonOption = None,
+    model_out: ModelOption = None,
+) -> None:
+    """What physics the robot file leaves out: where, how sure, and how much better it predicts unseen motion."""
+    from ident.explain.contract import to_json
+    from ident.explain.explain import explain as run
+    from ident.explain.printout import render
+    from ident.explain.recorded import runs as sessions
+    from protocols import config
+    from protocols.recording import read_recording
+    from protocols.robot import load as load_robot
+
+    given = None if robot is None else load_robot(robot)
+    seen = [read_recording(Path(r), given) for r in recordings]
+    unseen = [read_recording(Path(r), given) for r in validate or []]
+    with progress() as told:
+        answer = run(sessions(seen), seen[0].robot, sessions(unseen), progress=told)
+    if json == "-":
+        sys.stdout.write(to_json(answer.explanation).decode())
+    else:
+        print(render(answer.explanation))
+        if json:
+            Path(json).write_bytes(to_json(answer.explanation))
+    if model_out:
+        Path(model_out).write_text(config.to_toml(answer.robot))
+        log(f"written: {model_out}")
+
+
+@app.command()
 def compare(
     recording: Annotated[Path, typer.Argument(metavar="RUN.mcap")],
     robots: Annotated[list[str], typer.Argument(metavar="ROBOT_A.toml ROBOT_B.toml...")],

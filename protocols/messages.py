@@ -121,7 +121,7 @@ class IdentifyRequest(Message, frozen=True):
     """
 
     id: Name
-    methods: Annotated[list[Method], Meta(min_length=1, max_length=8)]
+    methods: Annotated[list[Method], Meta(min_length=1, max_length=len(get_args(Method)))]
     runs: Annotated[list[Attached | Logged], Meta(min_length=1, max_length=64)]
     validation: Annotated[list[Attached | Logged], Meta(max_length=64)] = []
     robot_toml: str | None = None

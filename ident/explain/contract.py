@@ -1,9 +1,10 @@
 """What `explain --json` prints: keys as the command line promises them, and some more."""
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
+import numpy as np
 
 from protocols.errors import ConfigError
 
@@ -232,7 +233,14 @@ class Explanation(msgspec.Struct, frozen=True, kw_only=True):
 
 def to_json(explanation: Explanation) -> bytes:
     """One object; ends with a newline."""
-    return msgspec.json.format(msgspec.json.encode(explanation), indent=2) + b"\n"
+    return msgspec.json.format(msgspec.json.encode(explanation, enc_hook=_plain), indent=2) + b"\n"
+
+
+def _plain(value: Any) -> Any:
+    """numpy's scalars as Python's; they compare alike but msgspec knows only the latter."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise NotImplementedError(f"{type(value).__name__} has no JSON form")
 
 
 def from_json(text: bytes) -> Explanation:

@@ -62,10 +62,11 @@ class Delay(Hypothesis):
     experiments = ("dither",)
 
     def columns(self, scene: Scene, view: View, joint: int, theta: Theta) -> Array:
-        return -_rate(view.total[:, [joint]], view)
+        return -_rate(_smooth_torque(scene, view)[:, [joint]], view)
 
     def plausible(self, scene: Scene, joint: int, theta: Theta, c: Array) -> Flags:
-        return within(c, EARLIEST_S, LATEST_S)
+        measured = all(view.motion.measured for view in scene.views)
+        return within(c, 0.0 if measured else EARLIEST_S, LATEST_S)
 
     def parameters(self, scene: Scene, joint: int, theta: Theta, c: Array, std: Array) -> list[Parameter]:
         return [parameter(scene, joint, self.effect, "delay_s", c[0], std[0])]
@@ -80,7 +81,7 @@ class CommonDelay(Delay):
         return [{}] if joint == 0 and scene.joints > 1 else []
 
     def columns(self, scene: Scene, view: View, joint: int, theta: Theta) -> Array:
-        return -_rate(view.total, view).T[:, :, None]
+        return -_rate(_smooth_torque(scene, view), view).T[:, :, None]
 
 
 class Saturation(Hypothesis):
@@ -194,6 +195,13 @@ def harmonics(motor_angle: Array, theta: Theta) -> Array:
     out = np.empty((len(angles), 2 * angles.shape[1]))
     out[:, ::2], out[:, 1::2] = np.sin(angles), np.cos(angles)
     return out
+
+
+def _smooth_torque(scene: Scene, view: View) -> Array:
+    """All torque but dry friction, shape (T, J): a joint that sticks when it turns swings its friction early, which is
+    no error of time."""
+    dry = [scene.coulomb[j] * scene.sign(view, j) for j in range(scene.joints)]
+    return np.asarray(view.total - np.column_stack(dry))
 
 
 def _rate(total: Array, view: View) -> Array:

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,7 @@ class Motion:
         circular: The end joins the beginning.
         each_tau, each_qdd: What the periods differ by from their mean, shape (periods, T, J).
         temperature_C: Of the motors, shape (T, J); None where not recorded.
+        measured: Torque is from currents that the drives measured, whose age is known; else it may be a command.
     """
 
     source: str
@@ -81,7 +82,7 @@ class Motion:
     each_tau: Array
     each_qdd: Array
     temperature_C: Array | None = None
-    notes: tuple[str, ...] = field(default_factory=tuple)
+    measured: bool = False
 
     @property
     def samples(self) -> int:
@@ -211,6 +212,7 @@ def _single(run: Run, index: int, segment: Segment, period_s: float, factor: int
         each_tau=np.zeros((0, t.size, J)),
         each_qdd=np.zeros((0, t.size, J)),
         temperature_C=_temperature(run, t[None]),
+        measured=bool((run.signals.delay_s > 0).any()),
     )
 
 
@@ -248,6 +250,7 @@ def _repeated(
         each_tau=each_tau,
         each_qdd=each_qdd,
         temperature_C=_temperature(run, t),
+        measured=bool((run.signals.delay_s > 0).any()),
     )
 
 

@@ -29,7 +29,7 @@ class View:
         total: All of its torque.
         axis_inertia: Of each joint with its rotor; `link_inertia` without.
         residual: Measured torque less `total`.
-        clock_s: Session time, shape (T,).
+        cache: What hypotheses compute once for all points of their grids.
     """
 
     motion: Motion
@@ -38,6 +38,7 @@ class View:
     total: Array
     axis_inertia: Array
     link_inertia: Array
+    cache: dict[str, tuple[Array, ...]] = field(default_factory=dict)
 
     @property
     def residual(self) -> Array:

@@ -108,11 +108,15 @@ class BaseFlexibility(Hypothesis):
         axis = int(theta["axis"])
         links = scene.theta[: 10 * scene.joints]
         slides = scene.joints == 1
-        wrench, carried = _base_torque(scene.model.geometry, view, links, axis, slides=slides)
+        key = f"base {axis}"
+        if key not in view.cache:
+            tilted = np.zeros(0) if slides else _tilted(scene, view, links, axis)
+            view.cache[key] = (*_base_torque(scene.model.geometry, view, links, axis, slides=slides), tilted)
+        wrench, carried, tilted = view.cache[key]
         angle, acceleration = _oscillation(wrench, view, theta["frequency_Hz"])
         load = (carried * acceleration[:, None]).T
         if not slides:
-            load = load + _tilted(scene, view, links, axis) * angle
+            load = load + tilted * angle
         return load[:, :, None]
 
     def plausible(self, scene: Scene, joint: int, theta: Theta, c: Array) -> Flags:

@@ -3,15 +3,10 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.linalg import expm
 
-from emulator.forward import smooth_acceleration, workspace
-from emulator.forward import Chain
-from emulator.simulator import Control, Dynamics, Exact, Smooth, axis_inertia, reference_of, simulate
-from ident.model import Model
-from protocols.motion import Reference
-from protocols.robot import Geometry, Robot, geometry
+from emulator.forward import Chain, smooth_acceleration, workspace
+from emulator.simulator import Dynamics
+from protocols.robot import Geometry
 
 Array = np.ndarray
 

@@ -88,7 +88,7 @@ def run_all(selected: tuple[str, ...], root: Path) -> tuple[dict[str, tuple[str,
             if outcomes.get(name, ("passed",))[0] == "passed":
                 outcomes[name] = outcome, text
         reports.unlink()
-    return outcomes, done.stdout.decode(errors="replace")
+    return outcomes, f"{done.stdout.decode(errors='replace')}\n(exit code {done.returncode})"
 
 
 @pytest.hookimpl(trylast=True)

@@ -99,11 +99,11 @@ def run_session(folder: Path, *, virtual_time: bool, abuse: bool = True) -> Sess
             dump.wait()
             if abuse:
                 mistreat(abused)
-            passed = carried() - before
+            os.kill(emulator.pid, signal.SIGINT)
+            emulated = emulator.finish()
+            passed = carried() - before  # nobody is left to send
             os.kill(abused.pid, signal.SIGINT)
             last = abused.finish()
-        os.kill(emulator.pid, signal.SIGINT)
-        emulated = emulator.finish()
     lines = (folder / "dump.log").read_text().splitlines()
     return Session(folder, said, lines, recorded, last, emulated, passed)
 
