@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+# Our matrices are small and many: a second BLAS thread makes them slower, on a busy machine 70 times (measured).
+export OPENBLAS_NUM_THREADS ?= 1
 
 .PHONY: help demo test lint bench janot fuzz soak lock clean
 
