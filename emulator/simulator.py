@@ -140,7 +140,14 @@ def _step(J: int, dynamics: Dynamics, control: Control, reference: Reference, su
     }
     for what, joints in counts.items():
         if joints != J:
-            raise ConfigError(f"The {what} have {joints} joints, the arm has {J}.")
+            raise ConfigError(f"Number of joints: {joints} in the {what}, {J} in the arm.")
+    for name, values in (("q", reference.q), ("qd", reference.qd), ("qdd", reference.qdd)):
+        if not np.isfinite(values).all():
+            n, j = (int(k) for k in np.argwhere(~np.isfinite(values))[0])
+            raise ConfigError(
+                f"The reference's {name} of joint {j + 1} is {values[n, j]} at sample {n}."
+                " Simulate stretches without gaps."
+            )
     T = len(reference.t_s)
     if T < 2 or substeps < 1:
         raise ConfigError(f"{T} samples with {substeps} substeps cannot be simulated; take at least 2 and 1.")

@@ -23,7 +23,6 @@ from emulator.plant import AMBIENT_C
 from emulator.rig import EmulatedRig
 from emulator.trialeffects import ALIKE, DRAWS, MOST_CHANGE, draw_effect, draw_unlisted, scaled
 from emulator.trialmotions import Planned, once, session
-from protocols import config
 from protocols.effectparams import EFFECT_KINDS
 from protocols.effects import Effect
 from protocols.errors import ConfigError
@@ -176,7 +175,7 @@ def draw(seed: int, rig: Name = "emps", kind: Kind | None = None, effect: Effect
     planned = session(robot, rng, PERIOD_S[rig])
     noise = tuple((np.array(shipped.emulated.current_noise_A) * rng.uniform(0.5, 1.5)).tolist())
     emulated = msgspec.structs.replace(shipped.emulated, machine=None, seed=seed, current_noise_A=noise)
-    rig_file = msgspec.structs.replace(shipped, name=f"{shipped.name} {seed}", emulated=emulated)
+    rig_file = msgspec.structs.replace(shipped, emulated=emulated)
     rise = rng.uniform(*SESSION_RISE_K)
     starts = PAUSE_S * np.arange(len(planned))
     runs = tuple(
@@ -385,8 +384,3 @@ def _aim(entry: EffectEntry, goal: float, plain: Floats, scene: _Scene, seed: in
         total *= factor
         entry = scaled(entry, factor)
     return _Hidden(entry, strength, scene.robot.joint_names[int(np.argmax(each))])
-
-
-def robot_file(case: Case) -> str:
-    """TOML of the robot file that the explainer gets."""
-    return config.to_toml(case.robot)
