@@ -56,7 +56,8 @@ def test_no_file_has_grown_beyond_one_job() -> None:
 
 def test_nothing_names_this_machine() -> None:
     """Neither where the checkout lies nor whose it is; wherever the test runs."""
-    places = [str(place) for place in (ROOT, ROOT.parent, Path.home()) if len(place.parts) > 1]
+    # A checkout right under the root has a name too short to mean anything in a text.
+    places = [str(place) for place, least in ((ROOT, 3), (Path.home(), 2)) if len(place.parts) >= least]
     pattern = re.compile("|".join(re.escape(place) + r"/" for place in places) + r"|/home/\w")
     found = [
         f"{path.relative_to(ROOT)}: {line.strip()[:100]}"
